@@ -1,0 +1,195 @@
+"""The calibrated stereo camera: rectify images, project points, triangulate pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from suturetrack.types import Float64, Image, InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One camera of the rig."""
+
+    matrix: Float64
+    """(3, 3) K of the raw image, px."""
+    distortion: Float64
+    """OpenCV's distortion coefficients of the raw image; zeros for none."""
+    rectification: Float64
+    """(3, 3) rotation from the camera's own axes to the rectified axes."""
+    projection: Float64
+    """(3, 4) from the rectified left frame to rectified pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRig:
+    """A stereo pair whose home frame is the rectified left camera; lengths in the calibration's unit."""
+
+    image_size: tuple[int, int]
+    """(width, height), px."""
+    left: Camera
+    right: Camera
+    metres_per_unit: float
+    """Length of the calibration's unit: 1.0 where it is in metres, 0.001 in millimetres."""
+
+    @classmethod
+    def from_calibration(
+        cls,
+        image_size: tuple[int, int],
+        left: tuple[Float64, Float64],
+        right: tuple[Float64, Float64],
+        rotation: Float64,
+        translation: Float64,
+        metres_per_unit: float,
+    ) -> StereoRig:
+        """The rig for `(K, D)` of both cameras and the pose `right_from_left` (OpenCV's R and T).
+
+        Images that are rectified already (no distortion, no rotation, T along x, one focal length)
+        are left alone; others get `cv2.stereoRectify` with `CALIB_ZERO_DISPARITY`.
+
+        Raises:
+            InputError: the right camera stands left of, above or below the left one.
+        """
+        if _is_rectified(left, right, rotation, translation):
+            rotations = np.eye(3), np.eye(3)
+            baseline = -float(translation[0])
+            shift = np.array([[0, 0, 0, -left[0][0, 0] * baseline], [0, 0, 0, 0], [0, 0, 0, 0]])
+            projections = np.c_[left[0], np.zeros(3)], np.c_[right[0], np.zeros(3)] + shift
+        else:
+            r1, r2, p1, p2, *_ = cv2.stereoRectify(
+                *left, *right, image_size, rotation, translation, flags=cv2.CALIB_ZERO_DISPARITY
+            )
+            rotations, projections = (r1, r2), (p1, p2)
+        if abs(projections[1][1, 3]) > abs(projections[1][0, 3]):
+            raise InputError("calibration: T runs along y; the cameras must stand side by side")
+        if projections[1][0, 3] >= 0:
+            raise InputError(
+                "calibration: the right camera stands left of the left one (T[0] > 0); "
+                "swap left and right, or give T as right_from_left"
+            )
+        cameras = [
+            Camera(np.asarray(k, float), np.asarray(d, float), r, p)
+            for (k, d), r, p in zip((left, right), rotations, projections, strict=True)
+        ]
+        return cls(image_size, cameras[0], cameras[1], metres_per_unit)
+
+    @property
+    def focal(self) -> float:
+        """Focal length along u of the rectified views, px."""
+        return float(self.left.projection[0, 0])
+
+    @property
+    def baseline(self) -> float:
+        """Distance of the cameras, calibration's unit."""
+        return float(-self.right.projection[0, 3] / self.right.projection[0, 0])
+
+    @cached_property
+    def is_rectified(self) -> bool:
+        """Whether raw pixels are rectified pixels."""
+        return all(
+            np.array_equal(c.rectification, np.eye(3)) and not c.distortion.any()
+            for c in (self.left, self.right)
+        )
+
+    def rectify(self, left: Image, right: Image) -> tuple[Image, Image]:
+        """Both raw images in rectified pixels; the images themselves where nothing is to do."""
+        if self.is_rectified:
+            return left, right
+        (l1, l2), (r1, r2) = self._maps
+        return (
+            cv2.remap(left, l1, l2, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+            cv2.remap(right, r1, r2, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+        )
+
+    def project(self, points: Float64) -> tuple[Float64, Float64]:
+        """(..., 3) points in the rectified left frame -> (..., 2) rectified pixels, left and right."""
+        return _project(self.left.projection, points), _project(self.right.projection, points)
+
+    def project_raw(self, points: Float64) -> tuple[Float64, Float64]:
+        """(..., 3) points in the rectified left frame -> (..., 2) pixels of the raw images."""
+        left, right = self.project(points)
+        if self.is_rectified:
+            return left, right
+        return _distort(self.left, left), _distort(self.right, right)
+
+    def rectify_pixels(self, pixels: Float64, *, right: bool = False) -> Float64:
+        """(..., 2) pixels of a raw image -> (..., 2) rectified pixels of the same view."""
+        if self.is_rectified:
+            return np.asarray(pixels, float)
+        camera = self.right if right else self.left
+        flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
+        rectified = cv2.undistortPoints(
+            flat, camera.matrix, camera.distortion, R=camera.rectification, P=camera.projection
+        )
+        return rectified.reshape(np.shape(pixels))
+
+    def triangulate(self, left: Float64, right: Float64) -> Float64:
+        """(..., 2) rectified pixels of both views -> (..., 3) points in the rectified left frame.
+
+        Rows need not agree: v is the mean of both. A disparity that is not positive gives a point
+        at infinity (inf).
+        """
+        p, q = self.left.projection, self.right.projection
+        left, right = np.asarray(left, float), np.asarray(right, float)
+        disparity = (left[..., 0] - p[0, 2]) - (right[..., 0] - q[0, 2])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = np.where(disparity > 0, p[0, 0] * self.baseline / disparity, np.inf)
+            x = (left[..., 0] - p[0, 2]) * z / p[0, 0]
+            y = ((left[..., 1] - p[1, 2]) + (right[..., 1] - q[1, 2])) / 2 * z / p[1, 1]
+        return np.stack([x, y, z], axis=-1)
+
+    def projection_jacobian(self, points: Float64) -> tuple[Float64, Float64]:
+        """(..., 3) points -> (..., 2, 3) derivatives of the rectified pixels, left and right."""
+        return _jacobian(self.left.projection, points), _jacobian(self.right.projection, points)
+
+    @cached_property
+    def _maps(self) -> list[tuple[Image, Image]]:
+        return [
+            cv2.initUndistortRectifyMap(
+                c.matrix, c.distortion, c.rectification, c.projection, self.image_size, cv2.CV_16SC2
+            )
+            for c in (self.left, self.right)
+        ]
+
+
+def _is_rectified(
+    left: tuple[Float64, Float64],
+    right: tuple[Float64, Float64],
+    rotation: Float64,
+    translation: Float64,
+) -> bool:
+    (k1, d1), (k2, d2) = left, right
+    return bool(
+        not np.any(d1)
+        and not np.any(d2)
+        and np.allclose(rotation, np.eye(3), atol=1e-9)
+        and np.allclose(translation[1:], 0, atol=1e-9 * abs(float(translation[0])))
+        and np.allclose(k1[[0, 1, 1], [0, 1, 2]], k2[[0, 1, 1], [0, 1, 2]], rtol=1e-6)
+    )
+
+
+def _project(projection: Float64, points: Float64) -> Float64:
+    homogeneous = np.asarray(points, float) @ projection[:, :3].T + projection[:, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+def _jacobian(projection: Float64, points: Float64) -> Float64:
+    homogeneous = np.asarray(points, float) @ projection[:, :3].T + projection[:, 3]
+    w = homogeneous[..., 2, None, None]
+    pixels = homogeneous[..., :2, None] / w
+    return (projection[:2, :3] - pixels * projection[2, :3]) / w
+
+
+def _distort(camera: Camera, pixels: Float64) -> Float64:
+    p = camera.projection
+    rays = np.concatenate(
+        [(pixels - p[:2, 2]) / p[[0, 1], [0, 1]], np.ones_like(pixels[..., :1])], -1
+    )
+    flat = (rays @ camera.rectification).reshape(-1, 1, 3)
+    raw, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
+    return raw.reshape(pixels.shape)

@@ -1,0 +1,1 @@
+"""The measured hot spots, compiled by numba; each has a literal NumPy twin in `tests/reference`."""

@@ -1,0 +1,81 @@
+"""How far a curve is from the truth: distances, length, ends, coverage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from suturetrack.types import Float64
+
+
+@dataclass(frozen=True)
+class CurveError:
+    """The distance between two curves given as dense points, in the unit of the points."""
+
+    mean: float
+    """Mean distance to the nearest point, each way, averaged."""
+    rms: float
+    """Root of the mean squared distance, both ways."""
+    p95: float
+    largest: float
+    length_percent: float
+    """Signed error of the length, in % of the truth."""
+    ends: tuple[float, float]
+    """Distances of the matching ends, in the order of the truth's ends, for the better direction."""
+
+
+def curve_error(estimate: Float64, truth: Float64) -> CurveError:
+    """Compares (k, dim) ordered points of a curve with (m, dim) ordered points of the true one.
+
+    Distances go from point to polyline segment on the other curve, so their floor does not depend on
+    the sampling.
+    """
+    forth, back = polyline_distances(estimate, truth), polyline_distances(truth, estimate)
+    both = np.r_[forth, back]
+    return CurveError(
+        mean=float((forth.mean() + back.mean()) / 2),
+        rms=float(np.sqrt(((forth**2).mean() + (back**2).mean()) / 2)),
+        p95=float(np.percentile(both, 95)),
+        largest=float(both.max()),
+        length_percent=100 * (polyline_length(estimate) / polyline_length(truth) - 1),
+        ends=end_distances(estimate, truth),
+    )
+
+
+def polyline_length(points: Float64) -> float:
+    """Length of the polyline through (k, dim) points."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def polyline_distances(points: Float64, polyline: Float64) -> Float64:
+    """(k,) distances from (k, dim) points to the polyline through (m, dim) points.
+
+    Only the segments beside the nearest vertex are looked at, which is exact for polylines sampled
+    finer than their distance to other strands.
+    """
+    _, nearest = cKDTree(polyline).query(points)
+    best = np.full(len(points), np.inf)
+    for step in (-1, 0):
+        i = np.clip(nearest + step, 0, len(polyline) - 2)
+        start, along = polyline[i], polyline[i + 1] - polyline[i]
+        squared = np.maximum((along**2).sum(1), np.finfo(float).tiny)
+        t = np.clip(((points - start) * along).sum(1) / squared, 0, 1)
+        best = np.minimum(best, np.linalg.norm(points - start - t[:, None] * along, axis=1))
+    return best
+
+
+def end_distances(estimate: Float64, truth: Float64) -> tuple[float, float]:
+    """Distances of the two ends in the order of the truth's, run in the direction that fits better."""
+    pairs = [
+        np.linalg.norm(ends - truth[[0, -1]], axis=1)
+        for ends in (estimate[[0, -1]], estimate[[-1, 0]])
+    ]
+    first, last = min(pairs, key=lambda d: float(d.sum()))
+    return float(first), float(last)
+
+
+def coverage(estimate: Float64, truth: Float64, radius: float) -> float:
+    """Share of the truth's points within `radius` of the estimated curve."""
+    return float((polyline_distances(truth, estimate) <= radius).mean())
