@@ -61,7 +61,12 @@ class StereoRig:
             projections = np.c_[left[0], np.zeros(3)], np.c_[right[0], np.zeros(3)] + shift
         else:
             r1, r2, p1, p2, *_ = cv2.stereoRectify(
-                *left, *right, image_size, rotation, translation, flags=cv2.CALIB_ZERO_DISPARITY
+                *left,
+                *right,
+                image_size,
+                rotation,
+                translation.reshape(3, 1),
+                flags=cv2.CALIB_ZERO_DISPARITY,
             )
             rotations, projections = (r1, r2), (p1, p2)
         if abs(projections[1][1, 3]) > abs(projections[1][0, 3]):
