@@ -50,20 +50,26 @@ def polyline_length(points: Float64) -> float:
 
 
 def polyline_distances(points: Float64, polyline: Float64) -> Float64:
-    """(k,) distances from (k, dim) points to the polyline through (m, dim) points.
+    """(k,) distances from (k, dim) points to the polyline through (m, dim) points."""
+    return np.asarray(np.linalg.norm(polyline_offsets(points, polyline), axis=1))
+
+
+def polyline_offsets(points: Float64, polyline: Float64) -> Float64:
+    """(k, dim) vectors from the nearest places on the polyline (m, dim) to the points (k, dim).
 
     Only the segments beside the nearest vertex are looked at, which is exact for polylines sampled
     finer than their distance to other strands.
     """
     _, nearest = cKDTree(polyline).query(points)
-    best = np.full(len(points), np.inf)
+    offsets = []
     for step in (-1, 0):
         i = np.clip(nearest + step, 0, len(polyline) - 2)
         start, along = polyline[i], polyline[i + 1] - polyline[i]
         squared = np.maximum((along**2).sum(1), np.finfo(float).tiny)
         t = np.clip(((points - start) * along).sum(1) / squared, 0, 1)
-        best = np.minimum(best, np.linalg.norm(points - start - t[:, None] * along, axis=1))
-    return best
+        offsets.append(points - start - t[:, None] * along)
+    nearer = np.linalg.norm(offsets[0], axis=1) <= np.linalg.norm(offsets[1], axis=1)
+    return np.where(nearer[:, None], *offsets)
 
 
 def end_distances(estimate: Float64, truth: Float64) -> tuple[float, float]:
