@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from suturetrack import nurbs
+from suturetrack.camera import StereoRig
 from suturetrack.types import Float64
 
 
@@ -85,3 +87,54 @@ def end_distances(estimate: Float64, truth: Float64) -> tuple[float, float]:
 def coverage(estimate: Float64, truth: Float64, radius: float) -> float:
     """Share of the truth's points within `radius` of the estimated curve."""
     return float((polyline_distances(truth, estimate) <= radius).mean())
+
+
+def physical_limit(
+    rig: StereoRig, points: Float64, noise_px: float = 0.05, knot_spacing_px: float = 16.0
+) -> float:
+    """RMS distance of the best curve that a centreline measured with that noise allows.
+
+    The posterior covariance of a cubic spline with a knot every `knot_spacing_px` along the left
+    image, measured once a pixel along its normal in both views, with a prior that knows how much the
+    thread bends and nothing else. Without a prior, stretches along the epipolar lines have no depth.
+
+    Args:
+        rig: the cameras.
+        points: (N, 3) true centreline, rectified left frame, calibration's unit.
+        noise_px: standard deviation of one measurement of the centreline, px.
+        knot_spacing_px: what a spline needs to take the thread's shape.
+
+    Returns:
+        Root mean square distance across the thread, calibration's unit.
+    """
+    travelled = _travelled(rig.project(points)[0])
+    samples = np.linspace(0, travelled[-1], max(int(travelled[-1]), 16))
+    points = np.stack([np.interp(samples, travelled, column) for column in points.T], axis=1)
+    s = samples / samples[-1]
+    count = max(int(samples[-1] / knot_spacing_px), 1) + 3
+    knots = nurbs.clamped_knots(np.linspace(0, 1, count - 2)[1:-1], 3)
+    a = nurbs.basis(s, knots, 3)
+    bending = nurbs.bending_matrix(knots, 3)
+    control_points = nurbs.fit(points, s, knots, 3).control_points
+    energy = float(np.einsum("id,ij,jd", control_points, bending, control_points))
+    information = np.kron(bending, np.eye(3)) * (control_points.size / energy)
+    for pixels, jacobian in zip(rig.project(points), rig.projection_jacobian(points), strict=True):
+        tangent = _unit(np.gradient(pixels, axis=0))
+        normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+        row = np.einsum("kd,kdi->ki", normal, jacobian) / noise_px
+        rows = (a[:, :, None] * row[:, None, :]).reshape(len(a), -1)
+        information += rows.T @ rows
+    covariance = np.linalg.pinv(information, hermitian=True).reshape(count, 3, count, 3)
+    of_points = np.einsum("ki,kj,iajb->kab", a, a, covariance, optimize=True)
+    tangent = _unit(np.gradient(points, axis=0))
+    along = np.einsum("ka,kab,kb->k", tangent, of_points, tangent)
+    return float(np.sqrt(np.mean(np.trace(of_points, axis1=1, axis2=2) - along)))
+
+
+def _travelled(points: Float64) -> Float64:
+    return np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+
+
+def _unit(vectors: Float64) -> Float64:
+    norm = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.maximum(norm, np.finfo(float).tiny)
