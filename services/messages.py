@@ -1,0 +1,61 @@
+"""What processes tell one another beyond the library's types; lengths are in metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from suturetrack.types import Nurbs, Stamp
+
+
+@dataclass(frozen=True)
+class Latency:
+    """How long after the source released a frame its result left a process, in ms; 0 before any."""
+
+    p50_ms: float = 0.0
+    p99_ms: float = 0.0
+    max_ms: float = 0.0
+
+
+@dataclass(frozen=True)
+class Health:
+    """The heartbeat of a process, once a second and when it ends."""
+
+    process: str
+    time_ns: int
+    """Wall clock of this heartbeat."""
+    stamp: Stamp | None
+    """Of the last frame that the process finished."""
+    rate_hz: float
+    """Frames finished per second since the last heartbeat."""
+    latency: Latency
+    """Of the frames since the last heartbeat."""
+    run_rate_hz: float
+    """Frames finished per second from the first one to the last one."""
+    run_latency: Latency
+    """Of every frame so far."""
+    frames: int
+    """Frames finished so far."""
+    dropped: int
+    """Frames so far that never reached this process or were passed over for a newer one."""
+    refused: int
+    """Bad messages so far, of every kind."""
+    memory_mb: float
+    """Resident memory."""
+    warning: str = ""
+    """What a person should know, for example that recording stopped; empty when all is well."""
+
+
+@dataclass(frozen=True)
+class SeedReply:
+    """What became of a seed."""
+
+    thread: str
+    accepted: bool
+    reason: str
+    """What was found, or why there is no thread to find, in words."""
+    stamp: Stamp | None = None
+    """The frame in which the thread was looked for; None when it was not looked for."""
+    curve: Nurbs | None = None
+    """The first curve, in metres; None when refused."""
+    candidates: tuple[tuple[float, float], ...] = ()
+    """When refused: the pixels (u, v) of the raw left image nearest to the seed that look like thread."""
