@@ -1,0 +1,274 @@
+"""Eq. (1) and Algorithm 1, row by row, so that what one step writes is still in cache for the next."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from suturetrack.types import Float32, Image
+
+_fast = {"fastmath": {"contract", "nnan", "ninf", "nsz", "arcp"}, "error_model": "numpy"}
+_zero, _half, _one, _two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+_tiny = np.float32(1e-20)
+
+
+@njit(cache=True, **_fast)
+def mix_channels(image: Image, weights: Float32, plane: Float32) -> None:
+    """plane[y, x] = weights . image[y, x] for an (H, W, 3) image."""
+    b, g, r = weights
+    for y in range(plane.shape[0]):
+        source, target = image[y], plane[y]
+        for x in range(plane.shape[1]):
+            target[x] = b * source[x, 0] + g * source[x, 1] + r * source[x, 2]
+
+
+@njit(cache=True, **_fast)
+def ridge_vectors(
+    plane: Float32,
+    taps: Float32,
+    shape: tuple[float, float],
+    signs: tuple[float, float],
+    keep_longer: bool,
+    vectors: Float32,
+    strength: Float32,
+) -> None:
+    """Eq. (1): V_r of every pixel of `plane`, edges replicated.
+
+    Args:
+        plane: (H, W).
+        taps: (3, r + 1) right half, centre first, of the Gaussian and its first two derivatives.
+        shape: (1 / (2 beta^2), 1 / (2 c^2)).
+        signs: lambda_2 / |lambda_2| must lie in this closed range: (1, 1) finds dark ridges,
+            (-1, -1) bright ones, (-1, 1) both.
+        keep_longer: whether a vector that `vectors` holds already stays where it is the longer one.
+        vectors: (2, H, W), written: u and v.
+        strength: (ceil(H / 4), W), written: S of every fourth row, 0 where the sign is refused.
+    """
+    height, width = plane.shape
+    radius = taps.shape[1] - 1
+    smooth, slope, curve = taps[0], taps[1], taps[2]
+    ring = np.empty((2 * radius + 1, width), np.float32)
+    padded = np.empty((3, width + 2 * radius), np.float32)
+    hessian = np.empty((3, width), np.float32)
+    for y in range(-radius, height + radius):
+        _pad(plane[min(max(y, 0), height - 1)], radius, padded[0])
+        _second_difference(padded[0], curve, ring[(y + radius) % len(ring)])
+        row = y - radius
+        if row < 0:
+            continue
+        _smooth_ring(ring, row + radius, smooth, hessian[0])
+        _vertical_derivatives(plane, row, slope, curve, padded[1:])
+        _smooth_row(padded[2], smooth, hessian[2])
+        _first_difference(padded[1], slope, hessian[1])
+        u, v = vectors[0, row], vectors[1, row]
+        _ridge_row(hessian, shape, signs, keep_longer, u, v, strength[row // 4])
+
+
+@njit(cache=True, **_fast)
+def _pad(row: Float32, radius: int, padded: Float32) -> None:
+    width = len(row)
+    padded[:radius] = row[0]
+    padded[radius : radius + width] = row
+    padded[radius + width :] = row[width - 1]
+
+
+# Every difference is taken before it is weighted: grey values are exact in float32, so the
+# derivatives are accurate relative to themselves and not to the brightness.
+
+
+@njit(cache=True, **_fast)
+def _second_difference(padded: Float32, taps: Float32, out: Float32) -> None:
+    radius = len(taps) - 1
+    centre = padded[radius:]
+    out[:] = _zero
+    for k in range(1, radius + 1):
+        before, after, tap = padded[radius - k :], padded[radius + k :], taps[k]
+        for x in range(len(out)):
+            out[x] += tap * ((before[x] - centre[x]) + (after[x] - centre[x]))
+
+
+@njit(cache=True, **_fast)
+def _first_difference(padded: Float32, taps: Float32, out: Float32) -> None:
+    radius = len(taps) - 1
+    out[:] = _zero
+    for k in range(1, radius + 1):
+        before, after, tap = padded[radius - k :], padded[radius + k :], taps[k]
+        for x in range(len(out)):
+            out[x] += tap * (after[x] - before[x])
+
+
+@njit(cache=True, **_fast)
+def _smooth_row(padded: Float32, taps: Float32, out: Float32) -> None:
+    radius = len(taps) - 1
+    centre = padded[radius:]
+    for x in range(len(out)):
+        out[x] = taps[0] * centre[x]
+    for k in range(1, radius + 1):
+        before, after, tap = padded[radius - k :], padded[radius + k :], taps[k]
+        for x in range(len(out)):
+            out[x] += tap * (before[x] + after[x])
+
+
+@njit(cache=True, **_fast)
+def _smooth_ring(ring: Float32, row: int, taps: Float32, out: Float32) -> None:
+    size = len(ring)
+    centre = ring[row % size]
+    for x in range(len(out)):
+        out[x] = taps[0] * centre[x]
+    for k in range(1, len(taps)):
+        above, below, tap = ring[(row - k) % size], ring[(row + k) % size], taps[k]
+        for x in range(len(out)):
+            out[x] += tap * (above[x] + below[x])
+
+
+@njit(cache=True, **_fast)
+def _vertical_derivatives(
+    plane: Float32, row: int, slope: Float32, curve: Float32, padded: Float32
+) -> None:
+    height, width = plane.shape
+    radius = len(slope) - 1
+    centre = plane[row]
+    first, second = padded[0, radius:], padded[1, radius:]
+    for x in range(width):
+        first[x] = second[x] = _zero
+    for k in range(1, radius + 1):
+        above, below = plane[max(row - k, 0)], plane[min(row + k, height - 1)]
+        tap1, tap2 = slope[k], curve[k]
+        for x in range(width):
+            up, down = above[x] - centre[x], below[x] - centre[x]
+            first[x] += tap1 * (down - up)
+            second[x] += tap2 * (up + down)
+    for line in padded:
+        line[:radius] = line[radius]
+        line[radius + width :] = line[radius + width - 1]
+
+
+@njit(cache=True, **_fast)
+def _ridge_row(
+    hessian: Float32,
+    shape: tuple[float, float],
+    signs: tuple[float, float],
+    keep_longer: bool,
+    out_u: Float32,
+    out_v: Float32,
+    strength: Float32,
+) -> None:
+    huu, huv, hvv = hessian[0], hessian[1], hessian[2]
+    ratio_scale, strength_scale = np.float32(shape[0]), np.float32(shape[1])
+    lowest, highest = np.float32(signs[0]), np.float32(signs[1])
+    for x in range(len(strength)):
+        trace, difference, twist = huu[x] + hvv[x], huu[x] - hvv[x], _two * huv[x]
+        root = np.sqrt(difference * difference + twist * twist)
+        # lambda_2 = sign (|trace| + root) / 2 has the larger magnitude.
+        sign = _one if trace > _zero else -_one
+        lambda_1, lambda_2 = _half * (abs(trace) - root), _half * (abs(trace) + root)
+        wanted = _one if (sign >= lowest) & (sign <= highest) else _zero
+        ratio = lambda_1 / (lambda_2 + _tiny)
+        s2 = wanted * (lambda_1 * lambda_1 + lambda_2 * lambda_2)
+        length = _decay(ratio * ratio * ratio_scale) * (_one - _decay(s2 * strength_scale))
+        # v_1 is half the angle whose cosine and sine these are, taken in [0, pi).
+        scale = -sign / (root + _tiny)
+        cosine, sine = difference * scale, twist * scale
+        major = np.sqrt(_half + _half * abs(cosine))
+        minor = _half * abs(sine) / major
+        u = length * (major if cosine >= _zero else minor)
+        v = length * (minor if cosine >= _zero else major)
+        u = u if sine >= _zero else -u
+        old_u, old_v = out_u[x], out_v[x]
+        keep = keep_longer & (old_u * old_u + old_v * old_v >= length * length)
+        out_u[x] = old_u if keep else u
+        out_v[x] = old_v if keep else v
+        strength[x] = np.sqrt(s2)
+
+
+@njit(inline="always", **_fast)
+def _decay(x: Any) -> Any:
+    """exp(-x) for x >= 0 within 2e-6: a series for x / 32, squared five times."""
+    t = min(x, np.float32(24)) * np.float32(1 / 32)
+    p = _one - t * np.float32(1 / 6)
+    p = _one - t * np.float32(1 / 5) * p
+    p = _one - t * np.float32(1 / 4) * p
+    p = _one - t * np.float32(1 / 3) * p
+    p = _one - t * _half * p
+    p = _one - t * p
+    p *= p
+    p *= p
+    p *= p
+    p *= p
+    return p * p
+
+
+@njit(cache=True, **_fast)
+def blur_angles(vectors: Float32, kernel: Float32, out: Float32) -> None:
+    """Algorithm 1, taps in raster order, edges replicated.
+
+    Args:
+        vectors: (2, H, W), V_r.
+        kernel: (5, 5), G.
+        out: (H, W, 2), written: V_o.
+    """
+    _, height, width = vectors.shape
+    ring = np.empty((5, 2, width + 4), np.float32)
+    sums = np.empty((2, width), np.float32)
+    for y in range(-2, height + 2):
+        line = ring[(y + 2) % 5]
+        for axis in range(2):
+            _pad(vectors[axis, min(max(y, 0), height - 1)], 2, line[axis])
+        row = y - 2
+        if row < 0:
+            continue
+        centre = ring[(row + 2) % 5]
+        for axis in range(2):
+            for x in range(width):
+                sums[axis, x] = kernel[2, 2] * centre[axis, x + 2]
+        for k in range(5):
+            _add_taps(ring[(row + k) % 5], kernel[k], k == 2, sums)
+        for x in range(width):
+            out[row, x, 0] = sums[0, x]
+            out[row, x, 1] = sums[1, x]
+
+
+@njit(cache=True, **_fast)
+def _add_taps(line: Float32, taps: Float32, skip_centre: bool, sums: Float32) -> None:
+    u, v, sum_u, sum_v = line[0], line[1], sums[0], sums[1]
+    t0, t1, t2, t3, t4 = taps
+    if skip_centre:
+        t2 = _zero
+    for x in range(len(sum_u)):
+        a, b = _add_tap(sum_u[x], sum_v[x], u[x], v[x], t0)
+        a, b = _add_tap(a, b, u[x + 1], v[x + 1], t1)
+        a, b = _add_tap(a, b, u[x + 2], v[x + 2], t2)
+        a, b = _add_tap(a, b, u[x + 3], v[x + 3], t3)
+        sum_u[x], sum_v[x] = _add_tap(a, b, u[x + 4], v[x + 4], t4)
+
+
+@njit(inline="always", **_fast)
+def _add_tap(a: Any, b: Any, u: Any, v: Any, tap: Any) -> Any:
+    signed = tap if a * u + b * v > _zero else -tap
+    return a + signed * u, b + signed * v
+
+
+@njit(cache=True, **_fast)
+def quantile(values: Float32, share: float) -> float:
+    """The value that `share` of `values` (non-negative) stay below, to 1/4096 of the largest."""
+    highest = _zero
+    for row in values:
+        for value in row:
+            highest = max(highest, value)
+    if highest == _zero:
+        return 0.0
+    counts = np.zeros(4097, np.int64)
+    scale = np.float32(4096) / highest
+    for row in values:
+        for value in row:
+            counts[int(value * scale)] += 1
+    wanted = math.ceil((1 - share) * values.size)
+    bin_ = 4096
+    above = counts[bin_]
+    while above < wanted:
+        bin_ -= 1
+        above += counts[bin_]
+    return float(bin_ / 4096 * highest)
