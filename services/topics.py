@@ -1,18 +1,17 @@
 """The wiring, as data: which process publishes what, of which type, under which key, and how it is read.
 
-Keys stand below `suturetrack/<rig>/`; a field of the message in braces is filled in from the message.
+Keys stand below `suturetrack/<rig>/`; a name in braces is a field of the message.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, TypeVar
 
 from services.messages import Health, SeedReply
 from suturetrack.camera import StereoRig
 from suturetrack.types import RidgeField, Seed, Stamp, StereoFrame, ThreadState, Truth
-
-ROOT = "suturetrack"
 
 T = TypeVar("T")
 Q = TypeVar("Q")
@@ -24,21 +23,12 @@ class Topic(Generic[T]):
     """A stream of messages."""
 
     key: str
-    type: type[T]
+    kind: type[T]
     publisher: str
     """Name of the process; "*" for every one."""
     keep: Literal["newest", "every"]
     """What a reader gets in real time: the newest message, or every one in order."""
     purpose: str
-
-    def key_of(self, message: T) -> str:
-        """The key below the rig under which a message goes."""
-        return self.key.format_map(_Fields(message))
-
-    @property
-    def pattern(self) -> str:
-        """The key expression below the rig that matches all messages of the topic."""
-        return self.key.format_map(_ANY)
 
 
 @dataclass(frozen=True)
@@ -46,15 +36,11 @@ class Question(Generic[Q, A]):
     """Something that one process answers when asked."""
 
     key: str
-    question: type[Q] | None
-    """None when the key says it all."""
+    kind: type[Q]
     answer: type[A]
     server: str
     """Name of the process that answers."""
     purpose: str
-
-    key_of = Topic.key_of
-    pattern = Topic.pattern
 
 
 FRAME = Topic("frame", StereoFrame, "source", "newest", "both raw images")
@@ -62,31 +48,40 @@ FIELD = Topic("field", RidgeField, "segmenter", "newest", "both rectified ridge 
 STATE = Topic("thread/{thread}/state", ThreadState, "tracker", "every", "the curve and its worth")
 TRUTH = Topic("thread/{thread}/truth", Truth, "source", "every", "where a synthetic thread is")
 SEEDING = Topic(
-    "thread/{thread}/seeding", Seed, "tracker", "every", "a seed from which the tracker now starts"
+    "thread/{thread}/seeding",
+    Seed,
+    "tracker",
+    "every",
+    "the seed from which a thread is looked for",
 )
 STEP = Topic("step", Stamp, "tracker", "every", "the tracker is done with this frame")
 HEALTH = Topic("health/{process}", Health, "*", "every", "heartbeat, once a second")
 TOPICS: tuple[Topic[Any], ...] = (FRAME, FIELD, STATE, TRUTH, SEEDING, STEP, HEALTH)
 
-CALIBRATION = Question("calibration", None, StereoRig, "source", "the rig that frames come from")
-SEED = Question("thread/{thread}/seed", Seed, SeedReply, "tracker", "find the thread from here")
+CALIBRATION: Question[None, StereoRig] = Question(
+    "calibration", type(None), StereoRig, "source", "the rig behind the frames"
+)
+SEED: Question[Seed, SeedReply] = Question(
+    "thread/{thread}/seed", Seed, SeedReply, "tracker", "find the thread from here"
+)
 QUESTIONS: tuple[Question[Any, Any], ...] = (CALIBRATION, SEED)
 
-ALIVE = "alive/{process}"
+
+def root(rig: str) -> str:
+    """What the keys of a rig begin with."""
+    return f"suturetrack/{rig}"
 
 
-class _Fields(dict[str, Any]):
-    def __init__(self, message: object):
-        super().__init__()
-        self._message = message
-
-    def __missing__(self, name: str) -> str:
-        return str(getattr(self._message, name))
+def alive(process: str) -> str:
+    """The liveliness key of a process; "*" for every one."""
+    return f"alive/{process}"
 
 
-class _Any(dict[str, str]):
-    def __missing__(self, name: str) -> str:
-        return "*"
+def key_of(topic: Topic[T] | Question[T, Any], message: T) -> str:
+    """The key below the rig under which a message goes."""
+    return re.sub(r"{(\w+)}", lambda field: str(getattr(message, field[1])), topic.key)
 
 
-_ANY = _Any()
+def pattern_of(topic: Topic[Any] | Question[Any, Any]) -> str:
+    """The key expression below the rig that matches every message of a topic."""
+    return re.sub(r"{\w+}", "*", topic.key)

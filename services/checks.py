@@ -1,0 +1,191 @@
+"""What a message must fulfil beyond its types before a process believes it."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.messages import Health, SeedReply
+from suturetrack.camera import Camera, StereoRig
+from suturetrack.types import (
+    Energies,
+    Grasp,
+    Nurbs,
+    RidgeField,
+    Seed,
+    Stamp,
+    StereoFrame,
+    ThreadState,
+    Truth,
+)
+
+NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+"""Names of rigs, processes and threads; they become parts of keys."""
+LARGEST_TIME = 2**63 - 1
+
+
+def check(message: object) -> None:
+    """Raises ValueError, naming the field, when a message holds impossible values."""
+    _CHECKS[type(message)](message)
+
+
+def check_name(name: str, what: str) -> None:
+    """Raises ValueError for a name that cannot be part of a key."""
+    if not NAME.fullmatch(name):
+        raise ValueError(f"{what} {name[:80]!r}: use 1 to 64 of A-Z a-z 0-9 _ -")
+
+
+def _require(condition: object, complaint: str) -> None:
+    if not condition:
+        raise ValueError(complaint)
+
+
+def _numbers(array: NDArray[Any], shape: tuple[int | None, ...], name: str) -> None:
+    fits = array.ndim == len(shape) and all(
+        wanted in (None, size) for size, wanted in zip(array.shape, shape, strict=True)
+    )
+    _require(fits, f"{name} has shape {array.shape}, expected {shape}")
+    _require(np.isfinite(array).all(), f"{name} holds values that are not finite")
+
+
+def _stamp(stamp: Stamp) -> None:
+    for name in ("frame", "capture_ns", "released_ns"):
+        _require(0 <= getattr(stamp, name) <= LARGEST_TIME, f"{name} {getattr(stamp, name)}")
+
+
+def _frame(frame: StereoFrame) -> None:
+    _stamp(frame.stamp)
+    shape = frame.left.shape
+    _require(len(shape) == 2 or (len(shape) == 3 and shape[2] == 3), f"images of shape {shape}")
+    _require(shape == frame.right.shape, f"left is {shape}, right is {frame.right.shape}")
+
+
+def _field(field: RidgeField) -> None:
+    _stamp(field.stamp)
+    shape = field.left.shape
+    _require(len(shape) == 3 and shape[2] == 2, f"a field of shape {shape}, expected (H, W, 2)")
+    _require(shape == field.right.shape, f"left is {shape}, right is {field.right.shape}")
+    for view in (field.left, field.right):
+        # NaN fails both comparisons.
+        bounded = view.min() >= -1.001 and view.max() <= 1.001
+        _require(bounded, "a field holds components that are not within [-1, 1]")
+
+
+def _curve(curve: Nurbs) -> None:
+    points, knots = curve.control_points, curve.knots
+    _require(1 <= curve.degree <= 9, f"degree {curve.degree}")
+    _numbers(points, (None, 3), "control_points")
+    _require(len(points) > curve.degree, f"{len(points)} control points of degree {curve.degree}")
+    _numbers(knots, (len(points) + curve.degree + 1,), "knots")
+    _require((np.diff(knots) >= 0).all(), "knots that decrease")
+    _require(knots[0] < knots[-1], "knots that span nothing")
+    _numbers(curve.weights, (len(points),), "weights")
+    _require((curve.weights > 0).all(), "weights that are not positive")
+
+
+def _energies(energies: Energies) -> None:
+    values = [energies.image_left, energies.image_right, energies.end, energies.internal]
+    _require(not np.isinf(values).any(), "energies that are infinite")
+
+
+def _state(state: ThreadState) -> None:
+    _stamp(state.stamp)
+    check_name(state.thread, "thread")
+    _energies(state.energies)
+    _numbers(state.sigma, (None,), "sigma")
+    _require((state.sigma >= 0).all(), "sigma is negative")
+    _require(state.seen.shape == state.sigma.shape, "seen and sigma differ in length")
+    if state.curve is None:
+        _require(np.isnan(state.length), "a length without a curve")
+    else:
+        _curve(state.curve)
+        _require(np.isfinite(state.length) and state.length >= 0, f"length {state.length}")
+
+
+def _truth(truth: Truth) -> None:
+    _stamp(truth.stamp)
+    check_name(truth.thread, "thread")
+    _numbers(truth.points, (None, 3), "points")
+    _require(truth.visible.shape == (len(truth.points),), "visible and points differ in length")
+    _require(np.isfinite(truth.length) and truth.length >= 0, f"length {truth.length}")
+
+
+def _seed(seed: Seed) -> None:
+    check_name(seed.thread, "thread")
+    _require((seed.pixel is None) != (seed.point is None), "exactly one of pixel and point")
+    _require(np.isfinite(seed.pixel or seed.point or ()).all(), "a seed that is not finite")
+
+
+def _seed_reply(reply: SeedReply) -> None:
+    check_name(reply.thread, "thread")
+    _require(np.isfinite(reply.candidates).all(), "candidates that are not finite")
+    if reply.stamp is not None:
+        _stamp(reply.stamp)
+    if reply.curve is not None:
+        _curve(reply.curve)
+
+
+def _grasp(grasp: Grasp) -> None:
+    _stamp(grasp.stamp)
+    check_name(grasp.thread, "thread")
+    _numbers(grasp.position, (3,), "position")
+    _numbers(grasp.rotation, (3, 3), "rotation")
+    _rotation(grasp.rotation, "rotation")
+    _require(np.isfinite(grasp.sigma) and grasp.sigma >= 0, f"sigma {grasp.sigma}")
+
+
+def _health(health: Health) -> None:
+    check_name(health.process, "process")
+    _require(0 <= health.time_ns <= LARGEST_TIME, f"time_ns {health.time_ns}")
+    if health.stamp is not None:
+        _stamp(health.stamp)
+    figures = [health.rate_hz, health.run_rate_hz, health.memory_mb]
+    for latency in (health.latency, health.run_latency):
+        figures += [latency.p50_ms, latency.p99_ms, latency.max_ms]
+    _require(np.isfinite(figures).all(), "figures that are not finite")
+    _require(min(health.frames, health.dropped, health.refused) >= 0, "counts that are negative")
+
+
+def _rig(rig: StereoRig) -> None:
+    width, height = rig.image_size
+    _require(1 <= min(width, height) <= max(width, height) <= 16384, f"image_size {rig.image_size}")
+    _require(0 < rig.metres_per_unit < np.inf, f"metres_per_unit {rig.metres_per_unit}")
+    for side, camera in (("left", rig.left), ("right", rig.right)):
+        _camera(camera, side)
+    _require(rig.baseline > 0, f"baseline {rig.baseline}")
+
+
+def _camera(camera: Camera, side: str) -> None:
+    _numbers(camera.matrix, (3, 3), f"{side} matrix")
+    _numbers(camera.distortion, (None,), f"{side} distortion")
+    _require(camera.distortion.size in (0, 4, 5, 8, 12, 14), f"{side} distortion coefficients")
+    _numbers(camera.rectification, (3, 3), f"{side} rectification")
+    _rotation(camera.rectification, f"{side} rectification")
+    _numbers(camera.projection, (3, 4), f"{side} projection")
+    _require(min(camera.projection[0, 0], camera.projection[1, 1]) > 0, f"{side} focal length")
+
+
+def _rotation(matrix: NDArray[Any], name: str) -> None:
+    _require(np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6), f"{name} is no rotation")
+
+
+def _anything(message: object) -> None:
+    del message
+
+
+_CHECKS: dict[type[Any], Any] = {
+    StereoFrame: _frame,
+    RidgeField: _field,
+    ThreadState: _state,
+    Truth: _truth,
+    Seed: _seed,
+    SeedReply: _seed_reply,
+    Grasp: _grasp,
+    Stamp: _stamp,
+    Health: _health,
+    StereoRig: _rig,
+    type(None): _anything,
+}

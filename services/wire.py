@@ -1,0 +1,218 @@
+"""Types <-> bytes.
+
+Frames and fields travel as their raw arrays, left then right; the header in the attachment gives
+shapes, dtype and stamp. Everything else travels as MessagePack, arrays as nested lists. The encoding
+names the schema and its version: `application/octet-stream;frame/1`, `application/msgpack;state/1`.
+Lengths on the wire are in metres.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, Protocol, TypeVar
+
+import msgspec
+import numpy as np
+
+from services import checks
+from services.messages import Health, SeedReply
+from suturetrack.camera import StereoRig
+from suturetrack.types import (
+    Grasp,
+    Nurbs,
+    RidgeField,
+    Seed,
+    Stamp,
+    StereoFrame,
+    ThreadState,
+    Truth,
+)
+
+T = TypeVar("T")
+
+LARGEST_SMALL_MESSAGE = 1 << 20
+"""Bytes of a MessagePack payload and of an attachment; a state of 100 control points has 5 kB."""
+LARGEST_SIDE = 8192
+"""Pixels."""
+
+_RAW: dict[type[Any], tuple[str, np.dtype[Any]]] = {
+    StereoFrame: ("frame/1", np.dtype("<u1")),
+    RidgeField: ("field/1", np.dtype("<f4")),
+}
+_SMALL: dict[type[Any], str] = {
+    ThreadState: "state/1",
+    Truth: "truth/1",
+    Seed: "seed/1",
+    SeedReply: "seed-reply/1",
+    Grasp: "grasp/1",
+    Stamp: "stamp/1",
+    Health: "health/1",
+    StereoRig: "rig/1",
+    type(None): "nothing/1",
+}
+
+
+class WireError(ValueError):
+    """A message that is refused; the text says why."""
+
+
+class Payload(Protocol):
+    """Bytes, or what turns into bytes when it is read."""
+
+    def __len__(self) -> int: ...
+    def __bytes__(self) -> bytes: ...
+
+
+@dataclass(frozen=True)
+class Packet:
+    """A message as it travels."""
+
+    encoding: str
+    payload: Payload
+    attachment: bytes
+
+
+_Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+_Side = Annotated[int, msgspec.Meta(ge=1, le=LARGEST_SIDE)]
+_Name = Annotated[str, msgspec.Meta(max_length=64)]
+
+
+class Header(msgspec.Struct, frozen=True):
+    """The attachment of every message, in MessagePack."""
+
+    publisher: _Name = ""
+    """Which run of which process sent it."""
+    number: _Count = 0
+    """Counts the publisher's messages under this key from 0, so that a reader sees gaps."""
+    sent_ns: _Count = 0
+    """Wall clock when it was sent."""
+    stamp: tuple[_Count, _Count, _Count] | None = None
+    """Frame number, capture time and release time of raw arrays."""
+    dtype: _Name = ""
+    shapes: Annotated[list[list[_Side]], msgspec.Meta(max_length=2)] = []
+    """Of the arrays in the payload, one after another."""
+
+
+def encoding_of(kind: type[Any]) -> str:
+    """The encoding under which a type travels."""
+    if kind in _RAW:
+        return f"application/octet-stream;{_RAW[kind][0]}"
+    return f"application/msgpack;{_SMALL[kind]}"
+
+
+def encode(message: object, publisher: str = "", number: int = 0, sent_ns: int = 0) -> Packet:
+    """A message as bytes; the arguments beside it go into its header."""
+    kind = type(message)
+    if isinstance(message, StereoFrame | RidgeField):
+        views = [np.ascontiguousarray(v, _RAW[kind][1]) for v in (message.left, message.right)]
+        stamp = (message.stamp.frame, message.stamp.capture_ns, message.stamp.released_ns)
+        shapes = [list(v.shape) for v in views]
+        header = Header(publisher, number, sent_ns, stamp, views[0].dtype.str, shapes)
+        payload = b"".join(view.data for view in views)
+    else:
+        header = Header(publisher, number, sent_ns)
+        payload = _ENCODER.encode(message)
+    return Packet(encoding_of(kind), payload, _ENCODER.encode(header))
+
+
+def decode(packet: Packet, kind: type[T]) -> tuple[T, Header]:
+    """A message of the expected type, checked, and its header.
+
+    Raises:
+        WireError: it has another schema or version, is malformed, or holds impossible values.
+    """
+    if packet.encoding != encoding_of(kind):
+        raise WireError(f"encoding {packet.encoding[:80]!r}, expected {encoding_of(kind)!r}")
+    if len(packet.attachment) > LARGEST_SMALL_MESSAGE:
+        raise WireError(f"header of {len(packet.attachment)} bytes")
+    try:
+        header = _HEADER_DECODER.decode(packet.attachment)
+        raw = kind in _RAW
+        message = _decode_raw(packet, kind, header) if raw else _decode_small(packet, kind)
+        checks.check(message)
+    except (ValueError, RecursionError, OverflowError) as error:
+        raise WireError(str(error)) from error
+    return message, header
+
+
+def _decode_raw(packet: Packet, kind: type[Any], header: Header) -> Any:
+    dtype = _RAW[kind][1]
+    if header.dtype != dtype.str:
+        raise WireError(f"dtype {header.dtype!r}, expected {dtype.str!r}")
+    if header.stamp is None or len(header.shapes) != 2:
+        raise WireError("the header lacks the stamp or the two shapes")
+    sizes = [math.prod(shape) for shape in header.shapes]
+    if len(packet.payload) != sum(sizes) * dtype.itemsize:
+        raise WireError(f"{len(packet.payload)} bytes for shapes {header.shapes} of {dtype}")
+    data = np.frombuffer(bytes(packet.payload), dtype)
+    left, right = np.split(data, [sizes[0]])
+    return kind(
+        Stamp(*header.stamp), left.reshape(header.shapes[0]), right.reshape(header.shapes[1])
+    )
+
+
+def _decode_small(packet: Packet, kind: type[Any]) -> Any:
+    if len(packet.payload) > LARGEST_SMALL_MESSAGE:
+        raise WireError(f"{len(packet.payload)} bytes, at most {LARGEST_SMALL_MESSAGE} are taken")
+    return _DECODERS[kind].decode(bytes(packet.payload))
+
+
+def _array_to_list(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} has no form on the wire")
+
+
+def _list_to_array(kind: Any, value: object) -> object:
+    dtype = np.dtype(kind.__args__[1].__args__[0])
+    array = np.array(value)
+    if array.size and array.dtype.kind not in ("b" if dtype.kind == "b" else "fiu"):
+        raise ValueError(f"an array of {array.dtype}, expected {dtype}")
+    return array.astype(dtype)
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_array_to_list)
+_HEADER_DECODER = msgspec.msgpack.Decoder(Header)
+_DECODERS: dict[type[Any], msgspec.msgpack.Decoder[Any]] = {
+    kind: msgspec.msgpack.Decoder(kind, dec_hook=_list_to_array) for kind in _SMALL
+}
+
+
+def scaled(message: T, factor: float) -> T:
+    """The message with every length multiplied: from the calibration's unit to metres, or back."""
+    return _SCALE[type(message)](message, factor)
+
+
+def _scale_curve(curve: Nurbs, factor: float) -> Nurbs:
+    return dataclasses.replace(curve, control_points=curve.control_points * factor)
+
+
+def _scale_state(state: ThreadState, factor: float) -> ThreadState:
+    return dataclasses.replace(
+        state,
+        curve=state.curve and _scale_curve(state.curve, factor),
+        length=state.length * factor,
+        sigma=state.sigma * factor,
+    )
+
+
+def _scale_truth(truth: Truth, factor: float) -> Truth:
+    return dataclasses.replace(truth, points=truth.points * factor, length=truth.length * factor)
+
+
+def _scale_seed(seed: Seed, factor: float) -> Seed:
+    if seed.point is None:
+        return seed
+    x, y, z = seed.point
+    return dataclasses.replace(seed, point=(x * factor, y * factor, z * factor))
+
+
+_SCALE: dict[type[Any], Callable[[Any, float], Any]] = {
+    Nurbs: _scale_curve,
+    ThreadState: _scale_state,
+    Truth: _scale_truth,
+    Seed: _scale_seed,
+}
