@@ -157,6 +157,29 @@ def part(curve: Nurbs, start: float, stop: float) -> Nurbs:
     return _nurbs(BSpline(knots, spline.c[first : last - k - 1], k))
 
 
+def with_ends(curve: Nurbs, start: float, stop: float) -> Nurbs:
+    """The cubic curve over [start, stop], reparametrised to [0, 1], with as many control points.
+
+    `start` may be below 0 and `stop` above 1: the end pieces run on as polynomials. Only the three
+    control points at each end change; both ends must stay in their own knot spans.
+    """
+    c, t = _with_stop(curve.control_points, curve.knots, stop)
+    c, t = _with_stop(c[::-1], 1 - t[::-1], 1 - start)
+    return curve_from(3, (1 - t[::-1] - start) / (stop - start), c[::-1])
+
+
+def _with_stop(c: Float64, t: Float64, stop: float) -> tuple[Float64, Float64]:
+    """Moves the last knots to `stop`: the polar form of the last piece at its new knots."""
+    c = c.copy()
+    a, b, g = (stop - t[[-7, -6, -5]]) / (t[-1] - t[[-7, -6, -5]])
+    one = c[-3] + b * (c[-2] - c[-3])
+    two = c[-2] + g * (c[-1] - c[-2])
+    c[-3] = c[-4] + a * (c[-3] - c[-4])
+    c[-2] = c[-3] + b * (one - c[-3])
+    c[-1] = c[-2] + g * (one + g * (two - one) - c[-2])
+    return c, np.r_[t[:-4], np.full(4, stop)]
+
+
 def _homogeneous(curve: Nurbs) -> BSpline:
     w = curve.weights[:, None]
     return BSpline(curve.knots, np.c_[curve.control_points * w, w], curve.degree)

@@ -1,0 +1,129 @@
+"""What the field shows beside a curve: response profiles, the best path through them, its peaks."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from suturetrack.types import Float32, Float64
+
+Int64 = NDArray[np.int64]
+
+
+@numba.njit(cache=True, nogil=True)
+def response_at(field: Float32, u: float, v: float, tu: float, tv: float) -> float:
+    """(t.V)^2 / |V| of eq. (4) at pixel (u, v), bilinear; 0 outside the image.
+
+    The interpolated quantity has no sign to wrap, unlike V itself.
+    """
+    height, width = field.shape[0], field.shape[1]
+    if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+        return 0.0
+    column, row = min(int(u), width - 2), min(int(v), height - 2)
+    fu, fv = u - column, v - row
+    total = 0.0
+    for i in range(2):
+        for j in range(2):
+            x, y = field[row + i, column + j, 0], field[row + i, column + j, 1]
+            squared = x * x + y * y
+            if squared > 0:
+                share = (fv if i else 1 - fv) * (fu if j else 1 - fu)
+                along = tu * x + tv * y
+                total += share * along * along / np.sqrt(squared)
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def responses(field: Float32, pixels: Float64, tangents: Float64) -> Float64:
+    """(k,) responses at (k, 2) pixels for (k, 2) unit tangents."""
+    out = np.empty(len(pixels))
+    for j in range(len(pixels)):
+        out[j] = response_at(field, pixels[j, 0], pixels[j, 1], tangents[j, 0], tangents[j, 1])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def normal_profiles(
+    field: Float32, pixels: Float64, tangents: Float64, offsets: Float64
+) -> Float64:
+    """(k, m) responses at the m offsets along the normals (-tv, tu) of the k samples."""
+    out = np.empty((len(pixels), len(offsets)))
+    for j in range(len(pixels)):
+        u, v, tu, tv = pixels[j, 0], pixels[j, 1], tangents[j, 0], tangents[j, 1]
+        for i in range(len(offsets)):
+            out[j, i] = response_at(field, u - offsets[i] * tv, v + offsets[i] * tu, tu, tv)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def best_path(gain: Float64, stiffness: float, reach: int) -> Int64:
+    """The path of indices, one a row of `gain`, of the largest sum of gains less its roughness.
+
+    Args:
+        gain: (k, m) what each choice is worth.
+        stiffness: price of the squared step, in indices, from a row to the next.
+        reach: the largest step.
+    """
+    count, width = gain.shape
+    origin = np.zeros((count, width), np.int64)
+    best = gain[0].copy()
+    for j in range(1, count):
+        new = np.empty(width)
+        for i in range(width):
+            top, where = -np.inf, i
+            for h in range(max(0, i - reach), min(width, i + reach + 1)):
+                value = best[h] - stiffness * (i - h) * (i - h)
+                if value > top:
+                    top, where = value, h
+            new[i] = top + gain[j, i]
+            origin[j, i] = where
+        best = new
+    path = np.empty(count, np.int64)
+    path[count - 1] = np.argmax(best)
+    for j in range(count - 1, 0, -1):
+        path[j - 1] = origin[j, path[j]]
+    return path
+
+
+@numba.njit(cache=True, nogil=True)
+def peaks(profiles: Float64, path: Int64, half: int) -> tuple[Float64, Float64]:
+    """Sub-sample peaks beside the path.
+
+    From the path the nearest summit is climbed, and a parabola fitted to `half` samples on each side
+    of it.
+
+    Returns:
+        (k,) positions in indices, nan where there is no summit inside the profile; (k,) responses
+        there.
+    """
+    count, width = profiles.shape
+    position = np.full(count, np.nan)
+    height = np.zeros(count)
+    square = 0.0
+    fourth = 0.0
+    for x in range(-half, half + 1):
+        square += x * x
+        fourth += x**4
+    n = 2 * half + 1
+    for j in range(count):
+        i = path[j]
+        while i + 1 < width and profiles[j, i + 1] > profiles[j, i]:
+            i += 1
+        while i > 0 and profiles[j, i - 1] > profiles[j, i]:
+            i -= 1
+        height[j] = profiles[j, i]
+        if i < half or i >= width - half or profiles[j, i] <= 0:
+            continue
+        total = 0.0
+        linear = 0.0
+        quadratic = 0.0
+        for x in range(-half, half + 1):
+            y = profiles[j, i + x]
+            total += y
+            linear += x * y
+            quadratic += x * x * y
+        bend = (n * quadratic - square * total) / (n * fourth - square * square)
+        if bend < 0:
+            position[j] = i + min(max(-linear / square / (2 * bend), -1.0), 1.0)
+    return position, height

@@ -1,0 +1,194 @@
+"""Cubic curves in compiled loops: local basis, banded normal equations, their solution and inverse."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from suturetrack.types import Float64
+
+Int64 = NDArray[np.int64]
+
+DEGREE = 3
+ORDER = DEGREE + 1
+BANDWIDTH = 3 * ORDER
+"""Entries on and below the diagonal of the normal equations of a cubic curve in 3-D."""
+
+
+@numba.njit(cache=True, nogil=True)
+def local_basis(s: Float64, knots: Float64) -> tuple[Int64, Float64]:
+    """The four basis functions that are not zero at each parameter, with two derivatives.
+
+    Args:
+        s: (k,) parameters in [knots[3], knots[-4]].
+        knots: (n + 5,) knots of a cubic curve.
+
+    Returns:
+        (k,) index of the first of the four functions, and (3, k, 4) values, first and second
+        derivatives.
+    """
+    count = len(s)
+    spans = len(knots) - ORDER
+    first = np.empty(count, np.int64)
+    table = np.empty((3, count, ORDER))
+    for j in range(count):
+        x = s[j]
+        span = np.searchsorted(knots, x, side="right") - 1
+        span = min(max(span, DEGREE), spans - 1)
+        first[j] = span - DEGREE
+        n1 = np.zeros(2)
+        n2 = np.zeros(3)
+        n3 = np.zeros(4)
+        width = knots[span + 1] - knots[span]
+        n1[0] = (knots[span + 1] - x) / width
+        n1[1] = (x - knots[span]) / width
+        _raise_degree(n1, n2, 2, x, span, knots)
+        _raise_degree(n2, n3, 3, x, span, knots)
+        d1 = np.zeros(4)
+        d2 = np.zeros(3)
+        lower = np.zeros(3)
+        _differences(n2, d1, 3, span, knots)
+        _differences(n1, lower, 2, span, knots)
+        d2[:] = lower
+        second = np.zeros(4)
+        _differences(d2, second, 3, span, knots)
+        for i in range(ORDER):
+            table[0, j, i] = n3[i]
+            table[1, j, i] = d1[i]
+            table[2, j, i] = second[i]
+    return first, table
+
+
+@numba.njit(cache=True, nogil=True)
+def _raise_degree(
+    low: Float64, high: Float64, degree: int, x: float, span: int, knots: Float64
+) -> None:
+    for i in range(degree):
+        left, right = knots[span - degree + 1 + i], knots[span + 1 + i]
+        share = (x - left) / (right - left)
+        high[i] += (1 - share) * low[i]
+        high[i + 1] += share * low[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _differences(low: Float64, high: Float64, degree: int, span: int, knots: Float64) -> None:
+    for i in range(degree):
+        left, right = knots[span - degree + 1 + i], knots[span + 1 + i]
+        slope = degree * low[i] / (right - left)
+        high[i] -= slope
+        high[i + 1] += slope
+
+
+@numba.njit(cache=True, nogil=True)
+def combine(first: Int64, values: Float64, control_points: Float64) -> Float64:
+    """(k, dim) points of (n + 1, dim) control points, by the (k, 4) local basis `values`."""
+    count, dim = len(first), control_points.shape[1]
+    points = np.zeros((count, dim))
+    for j in range(count):
+        for i in range(ORDER):
+            for a in range(dim):
+                points[j, a] += values[j, i] * control_points[first[j] + i, a]
+    return points
+
+
+@numba.njit(cache=True, nogil=True)
+def add_rows(
+    first: Int64,
+    values: Float64,
+    information: Float64,
+    pull: Float64,
+    band: Float64,
+    gradient: Float64,
+) -> None:
+    """Adds the rows of the samples to the normal equations of the control points' step.
+
+    Args:
+        first, values: local basis (or a derivative of it) at the k samples.
+        information: (k, 3, 3) weighted outer products of the rows in the sample's own 3-D offset.
+        pull: (k, 3) weighted rows times what they should become.
+        band: (3 (n + 1), BANDWIDTH) lower band, `band[r, d]` is entry (r, r - d); added to.
+        gradient: (3 (n + 1),) right-hand side; added to.
+    """
+    for j in range(len(first)):
+        for i in range(ORDER):
+            row = 3 * (first[j] + i)
+            vi = values[j, i]
+            for a in range(3):
+                gradient[row + a] += vi * pull[j, a]
+            for h in range(i + 1):
+                v = vi * values[j, h]
+                for a in range(3):
+                    for b in range(3):
+                        d = 3 * (i - h) + a - b
+                        if d >= 0:
+                            band[row + a, d] += v * information[j, a, b]
+
+
+@numba.njit(cache=True, nogil=True)
+def factorize(band: Float64) -> bool:
+    """Cholesky factor of the lower band, in place; False where it is not positive definite."""
+    n, width = band.shape
+    for r in range(n):
+        for d in range(min(r, width - 1), -1, -1):
+            c = r - d
+            total = band[r, d]
+            for m in range(max(0, r - width + 1), c):
+                total -= band[r, r - m] * band[c, c - m]
+            if d == 0:
+                if total <= 0:
+                    return False
+                band[r, 0] = np.sqrt(total)
+            else:
+                band[r, d] = total / band[c, 0]
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def solve_factorized(factor: Float64, right: Float64) -> Float64:
+    """x with L L.T x = right for the banded Cholesky factor L."""
+    n, width = factor.shape
+    x = right.copy()
+    for r in range(n):
+        for m in range(max(0, r - width + 1), r):
+            x[r] -= factor[r, r - m] * x[m]
+        x[r] /= factor[r, 0]
+    for r in range(n - 1, -1, -1):
+        for m in range(r + 1, min(n, r + width)):
+            x[r] -= factor[m, m - r] * x[m]
+        x[r] /= factor[r, 0]
+    return x
+
+
+@numba.njit(cache=True, nogil=True)
+def band_of_inverse(factor: Float64) -> Float64:
+    """The lower band of (L L.T)^-1, by the backward recursion over the sparsity of L."""
+    n, width = factor.shape
+    inverse = np.zeros((n, width))
+    for r in range(n - 1, -1, -1):
+        reach = min(n - 1, r + width - 1)
+        for c in range(reach, r - 1, -1):
+            total = 1.0 / factor[r, 0] if c == r else 0.0
+            for m in range(r + 1, reach + 1):
+                high, low = (m, c) if m >= c else (c, m)
+                total -= factor[m, m - r] * inverse[high, high - low]
+            inverse[c, c - r] = total / factor[r, 0]
+    return inverse
+
+
+@numba.njit(cache=True, nogil=True)
+def sample_covariance(first: Int64, values: Float64, inverse: Float64) -> Float64:
+    """(k, 3, 3) covariance of the samples from the band of the control points' covariance."""
+    count = len(first)
+    covariance = np.zeros((count, 3, 3))
+    for j in range(count):
+        for i in range(ORDER):
+            for h in range(ORDER):
+                v = values[j, i] * values[j, h]
+                for a in range(3):
+                    for b in range(3):
+                        r, c = 3 * (first[j] + i) + a, 3 * (first[j] + h) + b
+                        covariance[j, a, b] += v * (
+                            inverse[r, r - c] if r >= c else inverse[c, c - r]
+                        )
+    return covariance
