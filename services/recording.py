@@ -1,0 +1,245 @@
+"""Each process's own Rerun recording of what it saw and decided.
+
+The stream writes to a file and nowhere else, so that no viewer can slow or stop the process.
+"""
+
+from __future__ import annotations
+
+import logging
+import platform
+import time
+import uuid
+from collections.abc import Iterable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+import numpy as np
+import rerun as rr
+
+from services import blueprint, drawing
+from services.drawing import Entry, Level
+from services.messages import Health
+from suturetrack.camera import StereoRig
+from suturetrack.types import (
+    InputError,
+    RidgeField,
+    Stamp,
+    StereoFrame,
+    ThreadState,
+    Truth,
+)
+
+APPLICATION = "suturetrack"
+RECORDING_VERSION = 1
+"""Grows when an older reader could misread a recording."""
+
+_log = logging.getLogger(__name__)
+_LONGEST_FLUSH_SECONDS = 0.05
+_STALLED_FLUSHES = 30
+
+
+class Recorder:
+    """Writes `<run_dir>/<process>.rrd`; nothing at all without a run folder.
+
+    A recording that cannot go on (full disk, removed folder) is closed with a loud message and a
+    `problem`, while the process goes on. Long runs roll over into parts `<process>.1.rrd`, ...;
+    so does a process that was started again.
+    """
+
+    problem: str | None = None
+    """Why nothing is recorded any more."""
+
+    def __init__(
+        self,
+        run_dir: Path | None,
+        process: str,
+        level: Level,
+        rig: StereoRig,
+        config: object = None,
+        flush_seconds: float = 1.0,
+        part_bytes: int = 1 << 30,
+    ) -> None:
+        """Opens the file and writes what does not change: cameras, versions and parameters.
+
+        Args:
+            run_dir: made when missing; None records nothing.
+            process: name of the process.
+            level: "light" (JPEG) or "full" (lossless images and fields).
+            rig: the calibrated cameras.
+            config: the process's parameters, a dataclass.
+            flush_seconds: what a killed process loses at most.
+            part_bytes: size at which the next part begins.
+
+        Raises:
+            InputError: the file cannot be made.
+        """
+        self._process, self._level, self._rig = process, level, rig
+        self._config, self._flush_seconds, self._part_bytes = config, flush_seconds, part_bytes
+        self._threads: list[str] = []
+        self._stream: rr.RecordingStream | None = None
+        self._stamp: Stamp | None = None
+        self._flushed = time.monotonic()
+        self._stalls = 0
+        if run_dir is None:
+            return
+        self._run_dir = Path(run_dir)
+        try:
+            self._run_dir.mkdir(parents=True, exist_ok=True)
+            # One name for all processes of the run makes their files one recording.
+            run = uuid.uuid5(uuid.NAMESPACE_URL, str(self._run_dir.resolve()))
+            self._stream = rr.RecordingStream(APPLICATION, recording_id=str(run))
+            self._open_part()
+        except (OSError, RuntimeError) as error:
+            raise InputError(f"recording: cannot write to {run_dir}: {error}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def frame(self, frame: StereoFrame, published_ns: int | None = None) -> None:
+        """Records both images; `published_ns` is now when not given."""
+        if self._stream is not None:
+            self._write(frame.stamp, drawing.frame(frame, self._level))
+            self._latency(frame.stamp, published_ns)
+
+    def field(self, field: RidgeField, published_ns: int | None = None) -> None:
+        """Records both fields."""
+        if self._stream is not None:
+            self._write(field.stamp, drawing.field(field, self._rig, self._level))
+            self._latency(field.stamp, published_ns)
+
+    def states(self, states: Sequence[ThreadState], published_ns: int | None = None) -> None:
+        """Records the states of all threads at one frame; lengths in the calibration's unit."""
+        if self._stream is None or not states:
+            return
+        for state in states:
+            self._introduce(state.thread)
+        stamp, published_ns = states[0].stamp, published_ns or time.time_ns()
+        self._write(stamp, drawing.states(states, self._rig, published_ns))
+        self._latency(stamp, published_ns)
+        for state in states:
+            for event in state.events:
+                self.log(f"thread {state.thread}: {event}")
+
+    def truth(self, truth: Truth) -> None:
+        """Records where a synthetic thread really is."""
+        if self._stream is not None:
+            self._write(truth.stamp, drawing.truth(truth))
+
+    def health(self, health: Health) -> None:
+        """Records the process's heartbeat, at its newest frame."""
+        quantities = ("rate_hz", "dropped", "memory_mb")
+        self._write(
+            health.stamp,
+            (
+                (f"/plots/{name}/{self._process}", rr.Scalars(getattr(health, name)))
+                for name in quantities
+            ),
+        )
+
+    def log(self, text: str, level: str = "INFO") -> None:
+        """Records a line of the process's log (DEBUG, INFO, WARN, ERROR), at the newest frame."""
+        self._write(self._stamp, [(f"/log/{self._process}", rr.TextLog(text, level=level))])
+
+    def flush_if_due(self) -> None:
+        """When it is time: sends to the disk what is waiting, begins a new part, looks for trouble."""
+        if self._stream is None or time.monotonic() - self._flushed < self._flush_seconds:
+            return
+        self._flushed = time.monotonic()
+        trouble = self._flush(self._stream)
+        if trouble:
+            self.problem = f"recording stopped: {trouble} ({self._path})"
+            _log.error("%s; everything else goes on", self.problem)
+            self.close()
+        elif self._path.stat().st_size >= self._part_bytes:
+            self._open_part()
+
+    def close(self) -> None:
+        """Completes the file; nothing is recorded afterwards."""
+        if self._stream is not None:
+            self._stream.disconnect()
+        self._stream = None
+
+    def _write(self, stamp: Stamp | None, entries: Iterable[Entry]) -> None:
+        if self._stream is None:
+            return
+        if stamp is not None:
+            self._stamp = stamp
+            # Times belong to the calling thread, so they are set on every call.
+            self._stream.set_time("frame", sequence=stamp.frame)
+            self._stream.set_time("capture", timestamp=np.datetime64(stamp.capture_ns, "ns"))
+        for entity, *what in entries:
+            self._stream.log(entity, *what)
+        self.flush_if_due()
+
+    def _write_static(self, entries: Iterable[Entry]) -> None:
+        assert self._stream is not None
+        for entity, *what in entries:
+            self._stream.log(entity, *what, static=True)
+
+    def _flush(self, stream: rr.RecordingStream) -> str | None:
+        try:
+            stream.flush(timeout_sec=_LONGEST_FLUSH_SECONDS)
+            self._stalls = 0
+        except RuntimeError as error:
+            self._stalls += 1
+            if "timed out" not in str(error):
+                return "the disk is full or cannot be written"
+            if self._stalls >= _STALLED_FLUSHES:
+                return "the disk is too slow"
+        return None if self._path.exists() else "the file or its folder was removed"
+
+    def _latency(self, stamp: Stamp, published_ns: int | None) -> None:
+        latency_ms = ((published_ns or time.time_ns()) - stamp.released_ns) / 1e6
+        self._write(stamp, [(f"/plots/latency_ms/{self._process}", rr.Scalars(latency_ms))])
+
+    def _introduce(self, thread: str) -> None:
+        if thread not in self._threads:
+            self._threads.append(thread)
+            self._write_static(drawing.thread_style(thread))
+            if self._stream is not None:
+                self._stream.send_blueprint(blueprint.blueprint(self._threads))
+
+    def _open_part(self) -> None:
+        """Directs the stream to the next free file; every part explains itself."""
+        assert self._stream is not None
+        name, number = self._run_dir / f"{self._process}.rrd", 0
+        while name.exists():
+            number += 1
+            name = self._run_dir / f"{self._process}.{number}.rrd"
+        self._path = name
+        sink = rr.FileSink(str(name))
+        self._stream.set_sinks(sink, default_blueprint=blueprint.blueprint(self._threads))
+        self._stream.send_recording_name(self._run_dir.name)
+        self._stream.reset_time()
+        self._write_static(drawing.rig(self._rig))
+        self._write_static(drawing.process_style(self._process))
+        self._write_static(self._about())
+        for thread in self._threads:
+            self._write_static(drawing.thread_style(thread))
+
+    def _about(self) -> list[Entry]:
+        about: dict[str, Any] = {
+            "recording_version": RECORDING_VERSION,
+            "level": self._level,
+            "started_ns": time.time_ns(),
+            "machine": f"{platform.node()}, {platform.machine()}, {platform.system()}",
+            "python": platform.python_version(),
+            **{p: version(p) for p in ("suturetrack", "numpy", "opencv-python-headless")},
+        }
+        settings = {} if self._config is None else msgspec.to_builtins(self._config, enc_hook=str)
+        text = msgspec.yaml.encode(settings).decode()
+        return [
+            (f"/run/{self._process}", drawing.values("About", about)),
+            (f"/run/{self._process}/parameters", rr.TextDocument(text)),
+        ]

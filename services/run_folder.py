@@ -1,0 +1,256 @@
+"""A run's recordings, read back."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+import weakref
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from rerun.chunk import RrdReader
+
+from services.recording import APPLICATION, RECORDING_VERSION
+from suturetrack.camera import Camera, StereoRig
+from suturetrack.types import (
+    Energies,
+    Float64,
+    InputError,
+    Nurbs,
+    Stamp,
+    Status,
+    ThreadState,
+    Truth,
+)
+
+Row = dict[str, Any]
+"""Columns of one row, with `entity`; lists are NumPy arrays, what was not logged is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedState:
+    """A state, in the calibration's unit, and when the tracker published it."""
+
+    state: ThreadState
+    published_ns: int
+
+    @property
+    def latency_ms(self) -> float:
+        """From the release of the frame to the publication of the state."""
+        return (self.published_ns - self.state.stamp.released_ns) / 1e6
+
+
+class RunFolder:
+    """All recordings of one run.
+
+    Files that a killed process left behind are read as far as they go; files that cannot be read,
+    or only in part, are named in `problems`.
+    """
+
+    def __init__(self, run_dir: Path | str) -> None:
+        """Opens every .rrd file of the folder.
+
+        Raises:
+            InputError: no such folder, or nothing in it that can be read.
+        """
+        self.path = Path(run_dir)
+        self.problems: list[str] = []
+        if not self.path.is_dir():
+            raise InputError(f"no run folder {self.path}; it is what `--run-dir` named")
+        files = sorted(self.path.glob("*.rrd"))
+        if not files:
+            raise InputError(f"{self.path}: no recordings (*.rrd) in this folder")
+        readers = {file: self._open(file) for file in files}
+        self._readers = {file: reader for file, reader in readers.items() if reader is not None}
+        if not self._readers:
+            raise InputError(f"{self.path}: no recording can be read: {'; '.join(self.problems)}")
+        self._check_version()
+
+    @property
+    def files(self) -> list[Path]:
+        """The readable recordings as they lie in the folder."""
+        return list(self._readers)
+
+    def rows(self, *contents: str) -> Iterator[Row]:
+        """Every row of the entities that match (`/plots/**`), in no order across entities."""
+        for reader in self._readers.values():
+            for chunk in reader.stream().filter(content=list(contents)):
+                yield from _rows(str(chunk.entity_path), chunk.to_record_batch())
+
+    def states(self) -> list[RecordedState]:
+        """All states of all threads, by frame and thread."""
+        rows = (row for row in self.rows("/rig/thread/**") if row["entity"].endswith("/nurbs"))
+        states = [_state(row) for row in rows]
+        return sorted(states, key=lambda s: (s.state.stamp.frame, s.state.thread))
+
+    def truths(self) -> list[Truth]:
+        """Where the synthetic threads really were, by frame and thread; empty for real scenes."""
+        truths = [_truth(row) for row in self.rows("/rig/truth/**")]
+        return sorted(truths, key=lambda t: (t.stamp.frame, t.thread))
+
+    def series(self, *contents: str) -> dict[str, tuple[Float64, Float64]]:
+        """Plotted numbers by entity: ((n,) frames, (n,) or (n, k) values), by frame."""
+        found: dict[str, list[tuple[int, Float64]]] = {}
+        for row in self.rows(*contents):
+            if "Scalars:scalars" in row:
+                point = (row.get("frame", -1), row["Scalars:scalars"])
+                found.setdefault(row["entity"], []).append(point)
+        series = {}
+        for entity, points in sorted(found.items()):
+            points.sort(key=lambda p: p[0])
+            values = np.array([value for _, value in points])
+            series[entity] = (
+                np.array([frame for frame, _ in points], float),
+                values[:, 0] if values.shape[1] == 1 else values,
+            )
+        return series
+
+    def rig(self) -> StereoRig:
+        """The cameras of the run.
+
+        Raises:
+            InputError: the recordings hold no calibration.
+        """
+        for row in self.rows("/run/calibration"):
+            numbers = {k.split(":")[1]: v for k, v in row.items() if k.startswith("Calibration:")}
+            left, right = (_camera(numbers, view) for view in ("left", "right"))
+            width, height = numbers["image_size"].tolist()
+            return StereoRig((width, height), left, right, float(numbers["metres_per_unit"][0]))
+        raise InputError(f"{self.path}: no calibration in the recordings")
+
+    def about(self) -> dict[str, Row]:
+        """Versions, machine and level, by process."""
+        return {
+            row["entity"].split("/")[-1]: {
+                key.split(":")[1]: value[0]
+                for key, value in row.items()
+                if key.startswith("About:")
+            }
+            for row in self.rows("/run/**")
+            if "About:level" in row
+        }
+
+    def _open(self, file: Path) -> RrdReader | None:
+        reader, reason = _reader(file)
+        if reader is None:
+            folder = Path(tempfile.mkdtemp(prefix="suturetrack-"))
+            weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+            repaired = folder / file.name
+            if _repair(file, repaired):
+                reader, _ = _reader(repaired)
+                self.problems.append(f"{file.name} is cut off; read up to there")
+            else:
+                self.problems.append(f"{file.name} is no recording ({reason})")
+        if reader is None:
+            return None
+        owners = {entry.application_id for entry in reader.recordings()}
+        if owners != {APPLICATION}:
+            self.problems.append(f"{file.name} is a recording of {', '.join(owners) or 'nothing'}")
+            return None
+        return reader
+
+    def _check_version(self) -> None:
+        newest = max((a["recording_version"] for a in self.about().values()), default=0)
+        if newest > RECORDING_VERSION:
+            self.problems.append(
+                f"recorded by a newer suturetrack (version {newest} of the recording's form, "
+                f"this one knows {RECORDING_VERSION}); read as far as it can be"
+            )
+
+
+def _reader(file: Path) -> tuple[RrdReader | None, str]:
+    with warnings.catch_warnings():
+        # Without the footer that a killed process could not write, the file is scanned.
+        warnings.simplefilter("ignore")
+        try:
+            reader = RrdReader(file)
+            reader.recordings()
+        except (RuntimeError, ValueError) as error:
+            return None, str(error).removeprefix(f"Failed to read RRD file at {file}: ")
+    return reader, ""
+
+
+def _repair(file: Path, repaired: Path) -> bool:
+    """Copies what is whole in a file that ends in the middle of a message."""
+    command = [sys.executable, "-m", "rerun", "rrd", "merge", str(file), "-o", str(repaired)]
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+def _rows(entity: str, batch: pa.RecordBatch) -> Iterator[Row]:
+    columns = dict(zip(batch.schema.names, batch.columns, strict=True))
+    for i in range(batch.num_rows):
+        row: Row = {"entity": entity}
+        for name, column in columns.items():
+            if column[i].is_valid:
+                row[name] = _value(column[i])
+        yield row
+
+
+def _value(scalar: pa.Scalar) -> Any:
+    if isinstance(scalar, pa.ListScalar):
+        values = scalar.values
+        return _array(values)
+    return scalar.value if isinstance(scalar, pa.TimestampScalar) else scalar.as_py()
+
+
+def _array(values: pa.Array) -> Any:
+    if pa.types.is_nested(values.type) and not pa.types.is_fixed_size_list(values.type):
+        return values.to_pylist()
+    if pa.types.is_fixed_size_list(values.type):
+        flat = values.flatten().to_numpy(zero_copy_only=False)
+        return flat.reshape(len(values), values.type.list_size)
+    return values.to_numpy(zero_copy_only=False)
+
+
+def _stamp(row: Row, kind: str) -> Stamp:
+    return Stamp(
+        int(row["frame"]), int(row[f"{kind}:capture_ns"][0]), int(row[f"{kind}:released_ns"][0])
+    )
+
+
+def _state(row: Row) -> RecordedState:
+    numbers = {k.split(":")[1]: v for k, v in row.items() if k.startswith("ThreadState:")}
+    curve = None
+    if "knots" in numbers:
+        points = numbers["control_points"].reshape(-1, 3)
+        curve = Nurbs(int(numbers["degree"][0]), numbers["knots"], points, numbers["weights"])
+    names = ("image_left", "image_right", "end", "internal")
+    state = ThreadState(
+        stamp=_stamp(row, "ThreadState"),
+        thread=str(numbers["thread"][0]),
+        status=Status(numbers["status"][0]),
+        curve=curve,
+        length=float(numbers["length"][0]),
+        energies=Energies(*(float(numbers[name][0]) for name in names)),
+        sigma=numbers["sigma"],
+        seen=numbers["seen"],
+        events=tuple(numbers.get("events", ())),
+    )
+    return RecordedState(state, int(numbers["published_ns"][0]))
+
+
+def _truth(row: Row) -> Truth:
+    return Truth(
+        stamp=_stamp(row, "Truth"),
+        thread=str(row["Truth:thread"][0]),
+        points=np.array(row["LineStrips3D:strips"][0], float),
+        length=float(row["Truth:length"][0]),
+        visible=row["Truth:visible"],
+    )
+
+
+def _camera(numbers: Row, view: str) -> Camera:
+    shapes: Sequence[tuple[str, tuple[int, ...]]] = (
+        ("matrix", (3, 3)),
+        ("distortion", (-1,)),
+        ("rectification", (3, 3)),
+        ("projection", (3, 4)),
+    )
+    return Camera(*(numbers[f"{view}_{name}"].reshape(shape) for name, shape in shapes))
