@@ -1,0 +1,108 @@
+"""From one seed to the first curve (Section V): grow, match, merge, fit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.initialization.fitting import Held, fit_marks, image_parameters, refine
+from suturetrack.initialization.growth import grow_thread, nearest_segment
+from suturetrack.initialization.matching import match
+from suturetrack.initialization.model import (
+    Growth,
+    Initialization,
+    InitializationConfig,
+    InitializationError,
+    ViewGrowth,
+)
+from suturetrack.initialization.segments import Ridges, find_ridges
+from suturetrack.types import Float64, InputError, RidgeField, Seed
+
+__all__ = [
+    "Growth",
+    "Initialization",
+    "InitializationConfig",
+    "InitializationError",
+    "ViewGrowth",
+    "initialize",
+]
+
+
+def initialize(
+    field: RidgeField,
+    rig: StereoRig,
+    seed: Seed,
+    config: InitializationConfig = InitializationConfig(),  # noqa: B008
+) -> Initialization:
+    """Finds the whole thread that `seed` lies on.
+
+    Raises:
+        InputError: the seed is outside the image.
+        InitializationError: there is no thread at the seed, or none like it in the right view.
+    """
+    pixel = seed_pixel(seed, rig)
+    ridges = find_ridges(field.left, config), find_ridges(field.right, config)
+    origin, candidates = nearest_segment(ridges[0], pixel, config.snap_px)
+    if origin is None:
+        raise InitializationError(_nothing_there(candidates, pixel, config), candidates)
+    chain, left = grow_thread(ridges[0], origin, pixel, config)
+    matched = match(chain, field.right, rig)
+    right = _right_growth(ridges[1], matched.right, config)
+    step = max(1, round(config.step_px))
+    marks = np.stack([chain.pixels[::step], matched.right[::step]], axis=1)
+    growth = Growth(left, right, marks)
+    response = float(np.median(matched.response))
+    if response < config.low or len(chain.pixels) < 4 * step:
+        reason = "the right view shows no thread along the epipolar lines of the left one"
+        if len(chain.pixels) < 4 * step:
+            reason = f"the ridge at the seed is only {len(chain.pixels)} px long"
+        raise InitializationError(reason, candidates, growth)
+    s = image_parameters(chain.pixels, matched.right)
+    points = rig.triangulate(chain.pixels, matched.right)
+    curve = fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
+    views = field.left, field.right
+    curve = refine(curve, views, rig, 2.0)
+    crests = Held.at(curve, views, rig).crests
+    residual = float(
+        np.mean([np.average(abs(c.offsets), weights=c.weights + 1e-9) for c in crests])
+    )
+    seen = float(np.mean([(c.weights > config.low).mean() for c in crests]))
+    return Initialization(curve, seen, (), residual, growth)
+
+
+def seed_pixel(seed: Seed, rig: StereoRig) -> Float64:
+    """(2,) the seed in the rectified left view.
+
+    Raises:
+        InputError: it is outside the image, or behind the camera.
+    """
+    if seed.point is not None:
+        point = np.asarray(seed.point, float)
+        if not point[2] > 0:
+            raise InputError(f"seed {seed.point}: it is behind the camera; z must be positive")
+        pixel = rig.project(point)[0]
+    else:
+        pixel = rig.rectify_pixels(np.asarray(seed.pixel, float))
+    width, height = rig.image_size
+    if not (-0.5 <= pixel[0] <= width - 0.5 and -0.5 <= pixel[1] <= height - 0.5):
+        raise InputError(
+            f"seed ({pixel[0]:.0f}, {pixel[1]:.0f}) is outside the {width}x{height} left image"
+        )
+    return pixel
+
+
+def _right_growth(ridges: Ridges, pixels: Float64, config: InitializationConfig) -> ViewGrowth:
+    middle = pixels[len(pixels) // 2]
+    origin, _ = nearest_segment(ridges, middle, np.inf)
+    if origin is None:
+        cost = np.full(ridges.magnitude.shape, np.inf, np.float32)
+        return ViewGrowth(cost, (), np.empty((0, 2, 2)), ())
+    return grow_thread(ridges, origin, middle, config)[1]
+
+
+def _nothing_there(candidates: Float64, pixel: Float64, config: InitializationConfig) -> str:
+    text = f"no thread within {config.snap_px:g} px of the seed ({pixel[0]:.0f}, {pixel[1]:.0f})"
+    if len(candidates) == 0:
+        return text + "; the left view shows no ridge at all"
+    near = ", ".join(f"({u:.0f}, {v:.0f})" for u, v in candidates)
+    return f"{text}; the nearest ridges are at {near}"

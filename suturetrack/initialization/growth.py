@@ -1,0 +1,109 @@
+"""Growing out from the seed over one view: which segments are reached, and which make the thread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from suturetrack.initialization.model import InitializationConfig, ViewGrowth
+from suturetrack.initialization.segments import Ridges
+from suturetrack.initialization.topology import follow, merge_ends
+from suturetrack.kernels import growth as kernel
+from suturetrack.types import Bool, Float32, Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A thread in one view, from end to end."""
+
+    pixels: Float64
+    """(k, 2) about one pixel apart."""
+    seen: Bool
+    """(k,) False where a gap was bridged."""
+
+
+def nearest_segment(ridges: Ridges, seed: Float64, reach: float) -> tuple[int | None, Float64]:
+    """The segment that a seed (2,) means, None if there is none within `reach`, and (k, 2) the
+    nearest ridge points, one a segment."""
+    nearest = [s[np.argmin(np.linalg.norm(s - seed, axis=1))] for s in ridges.segments]
+    if not nearest:
+        return None, np.empty((0, 2))
+    distance = np.linalg.norm(np.array(nearest) - seed, axis=1)
+    # Among ridges as near as the seed is exact, the long and clear one is meant.
+    weight = [min(len(s), 40) / 40 * ridges.sample(s).mean() for s in ridges.segments]
+    score = distance - 4 * np.array(weight)
+    score[distance > reach] = np.inf
+    candidates = np.array(nearest)[np.argsort(distance)[:3]]
+    best = int(np.argmin(score))
+    return (best if np.isfinite(score[best]) else None), candidates
+
+
+def grow_thread(
+    ridges: Ridges, origin: int, seed: Float64, config: InitializationConfig
+) -> tuple[Chain, ViewGrowth]:
+    """Grows by eq. (3) from the seed on segment `origin` and follows the merged segments."""
+    entries = follow(origin, merge_ends(ridges, config))
+    on_thread = [e // 2 for e in entries]
+    pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
+    merges = np.array([(a[-1], b[0]) for a, b in pairwise(pieces)])
+    cost = _grow(ridges, pieces, on_thread.index(origin), seed, config)
+    reached = [k for k, s in enumerate(ridges.segments) if _is_reached(s, cost)]
+    rejected = tuple(
+        (ridges.segments[k], "branches off without a matching end")
+        for k in reached
+        if k not in on_thread
+    )
+    segments = tuple(ridges.segments[k] for k in reached)
+    view = ViewGrowth(cost, segments, merges.reshape(-1, 2, 2), rejected)
+    return _join(pieces), view
+
+
+def _grow(
+    ridges: Ridges, pieces: list[Float64], first: int, seed: Float64, config: InitializationConfig
+) -> Float32:
+    """Cost image; where a merge bridges a gap the growth starts anew on the other side."""
+    cost = np.full(ridges.magnitude.shape, np.inf, np.float32)
+
+    def start(point: Float64, at: float) -> None:
+        u, v = np.rint(point).astype(int)
+        kernel.grow(ridges.magnitude, u, v, at, config.rho, config.low, cost)
+
+    def value(point: Float64) -> float:
+        u, v = np.rint(point).astype(int)
+        return float(cost[v, u])
+
+    origin = pieces[first]
+    start(origin[np.argmin(np.linalg.norm(origin - seed, axis=1))], 0.0)
+    ahead = list(pairwise(pieces[first:]))
+    behind = [(b[::-1], a[::-1]) for a, b in pairwise(pieces[: first + 1])][::-1]
+    for one, other in ahead + behind:
+        bridge = float(np.linalg.norm(other[0] - one[-1])) / config.low**config.rho
+        start(other[0], value(one[-1]) + bridge)
+    return cost
+
+
+def _is_reached(segment: Float64, cost: Float32) -> bool:
+    u, v = np.rint(segment).astype(int).T
+    return bool(np.isfinite(cost[v, u]).mean() > 0.5)
+
+
+def _join(pieces: list[Float64]) -> Chain:
+    """One chain through all pieces, straight over the gaps between them, smoothed a little."""
+    points, seen = [pieces[0]], [np.ones(len(pieces[0]), bool)]
+    for a, b in pairwise(pieces):
+        count = int(np.linalg.norm(b[0] - a[-1]))
+        share = np.arange(1, count)[:, None] / max(count, 1)
+        points += [a[-1] + share * (b[0] - a[-1]), b]
+        seen += [np.zeros(len(share), bool), np.ones(len(b), bool)]
+    return resample(Chain(np.concatenate(points), np.concatenate(seen)))
+
+
+def resample(chain: Chain) -> Chain:
+    """The chain at points one pixel apart."""
+    travelled = np.r_[0, np.cumsum(np.linalg.norm(np.diff(chain.pixels, axis=0), axis=1))]
+    at = np.linspace(0, travelled[-1], max(round(travelled[-1]), 1) + 1)
+    pixels = np.c_[[np.interp(at, travelled, c) for c in chain.pixels.T]].T
+    nearest = np.clip(np.searchsorted(travelled, at), 0, len(travelled) - 1)
+    return Chain(pixels, chain.seen[nearest])

@@ -1,0 +1,77 @@
+"""What the initialisation takes and gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from suturetrack.types import Float32, Float64, Nurbs
+
+
+@dataclass(frozen=True)
+class InitializationConfig:
+    """How one seed becomes a curve (Section V)."""
+
+    rho: float = 2.0
+    """Exponent of eq. (3): how strongly the growth prefers clear ridges."""
+    low: float = 0.12
+    """Length of the field's vectors below which a pixel is background."""
+    high: float = 0.4
+    """Length that a stretch of thread must reach somewhere."""
+    step_px: float = 6.0
+    """Step size: distance between the stereo points that are marked along the thread, px."""
+    snap_px: float = 8.0
+    """How far from the thread the seed may be, px."""
+    gap_px: float = 25.0
+    """Longest gap in the ridge that is bridged, px."""
+    merge_angle_deg: float = 60.0
+    """Turn at which the ends of two segments no longer match."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewGrowth:
+    """What the growth found in one view (Fig. 3), in rectified pixels."""
+
+    cost: Float32
+    """(H, W) L of eq. (3); infinite where the growth did not come."""
+    segments: tuple[Float64, ...]
+    """Unbranched stretches of ridge that the growth reached, each (k, 2)."""
+    merges: Float64
+    """(m, 2, 2) the pairs of segment ends that were joined into the thread."""
+    rejected: tuple[tuple[Float64, str], ...]
+    """Segments that are no part of the thread, and why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """What the growth found, and the stereo points marked on the way."""
+
+    left: ViewGrowth
+    right: ViewGrowth
+    marks: Float64
+    """(k, 2, 2) left and right pixel of each mark, from end to end of the thread."""
+
+
+@dataclass(frozen=True, eq=False)
+class Initialization:
+    """The first curve of a thread."""
+
+    curve: Nurbs
+    """Cubic, unit weights; rectified left frame, calibration's unit."""
+    confidence: float
+    """In [0, 1]; below 0.5 the curve should not be relied on."""
+    reasons: tuple[str, ...]
+    """What lowers the confidence, and where the thread ends, in words."""
+    reprojection_px: float
+    """Mean distance of the projected curve from the crest of the ridge, both views, px."""
+    growth: Growth
+
+
+class InitializationError(Exception):
+    """No thread could be found; the message is the reason."""
+
+    def __init__(self, reason: str, candidates: Float64, growth: Growth | None = None) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.candidates = candidates
+        """(k, 2) ridge pixels nearest to the seed, rectified left view."""
+        self.growth = growth
