@@ -119,6 +119,7 @@ class _View:
         self._taps = [gaussian_taps(sigma) for sigma in config.sigmas]
         self._kernel = gaussian_kernel(config.blur)
         self._plane = np.empty((height, width), np.float32)
+        self._channels = [np.empty((height, width), np.uint8) for _ in range(3)]
         self._vectors = np.empty((2, height, width), np.float32)
         self._strength = np.zeros(((height + 3) // 4, width), np.float32)
         self._outputs = np.empty((_SLOTS, height, width, 2), np.float32)
@@ -128,7 +129,8 @@ class _View:
         if image.ndim == 2:
             np.copyto(self._plane, image)
         else:
-            ridge.mix_channels(image, weights, self._plane)
+            cv2.split(image, self._channels)
+            ridge.mix_channels(*self._channels, weights, self._plane)
         if self._c is None:
             self._filter(1.0)
             self._c = self._automatic_c()
@@ -152,7 +154,7 @@ class _View:
             )
 
     def _automatic_c(self) -> float:
-        return max(ridge.quantile(self._strength, 0.998) / 2, _LEAST_C)
+        return max(math.sqrt(ridge.quantile(self._strength, 0.998)) / 2, _LEAST_C)
 
 
 _PULL = 0.1
@@ -163,10 +165,11 @@ def gaussian_taps(sigma: float) -> Float32:
     """(3, r + 1) the right halves, centre first, of a Gaussian and of its first two derivatives.
 
     The derivatives are those of unit parabolas exactly, multiplied by sigma and sigma^2 so that
-    scales compare.
+    scales compare. Cut at 3 sigma and filled up with zeros to r, a multiple of 4.
     """
-    x = np.arange(math.ceil(3.5 * sigma) + 1, dtype=float)
-    smooth = np.exp(-(x**2) / (2 * sigma**2))
+    radius = math.ceil(3 * sigma)
+    x = np.arange(-(-radius // 4) * 4 + 1, dtype=float)
+    smooth = np.where(x <= radius, np.exp(-(x**2) / (2 * sigma**2)), 0)
     smooth /= smooth[0] + 2 * smooth[1:].sum()
     slope = x * smooth
     slope *= sigma / (2 * (x * slope).sum())

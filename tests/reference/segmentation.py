@@ -1,0 +1,80 @@
+"""Eq. (1) and Algorithm 1 to the letter, in float64 and pixel by pixel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+def gaussian_derivatives(sigma):
+    """(3, 2r + 1) taps, for correlation, of the Gaussian and of its first two derivatives."""
+    radius = math.ceil(3 * sigma)
+    x = np.arange(-radius, radius + 1, dtype=float)
+    g = np.exp(-(x**2) / (2 * sigma**2))
+    g /= g.sum()
+    first = x * g / (x**2 * g).sum()
+    second = (x**2 / sigma**2 - 1) * g
+    second -= second.sum() * g
+    second *= 2 / (x**2 * second).sum()
+    return g, sigma * first, sigma**2 * second
+
+
+def correlate(plane, taps_v, taps_u):
+    radius = len(taps_v) // 2
+    padded = np.pad(plane, radius, mode="edge")
+    rows = sum(t * padded[k : k + plane.shape[0]] for k, t in enumerate(taps_v))
+    return sum(t * rows[:, k : k + plane.shape[1]] for k, t in enumerate(taps_u))
+
+
+def ridge_vectors(plane, sigma, beta, c, polarity):
+    """Eq. (1): (H, W, 2)."""
+    plane = np.asarray(plane, np.float64)
+    g, g1, g2 = gaussian_derivatives(sigma)
+    hessian = np.empty((*plane.shape, 2, 2))
+    hessian[..., 0, 0] = correlate(plane, g, g2)
+    hessian[..., 0, 1] = hessian[..., 1, 0] = correlate(plane, g1, g1)
+    hessian[..., 1, 1] = correlate(plane, g2, g)
+    values, directions = np.linalg.eigh(hessian)
+    order = np.argsort(np.abs(values), axis=-1)
+    lambda_1, lambda_2 = np.moveaxis(np.take_along_axis(values, order, -1), -1, 0)
+    v_1 = np.take_along_axis(directions, order[..., None, :1], -1)[..., 0]
+    v_1 = np.where((v_1[..., 1:] < 0) | ((v_1[..., 1:] == 0) & (v_1[..., :1] < 0)), -v_1, v_1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.nan_to_num(lambda_1 / lambda_2)
+    strength = np.sqrt(lambda_1**2 + lambda_2**2)
+    length = np.exp(-(ratio**2) / (2 * beta**2)) * (1 - np.exp(-(strength**2) / (2 * c**2)))
+    if polarity == "dark":
+        length[lambda_2 < 0] = 0
+    if polarity == "bright":
+        length[lambda_2 > 0] = 0
+    return length[..., None] * v_1
+
+
+def strongest(fields):
+    """At every pixel the longest vector of several scales."""
+    fields = np.stack(fields)
+    best = np.argmax(np.linalg.norm(fields, axis=-1), axis=0)
+    return np.take_along_axis(fields, best[None, ..., None], 0)[0]
+
+
+def blur_angles(v_r, kernel):
+    """Algorithm 1, the taps in raster order."""
+    height, width, _ = v_r.shape
+    radius = len(kernel) // 2
+    padded = np.pad(v_r, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
+    v_o = np.empty_like(v_r)
+    for i in range(height):
+        for j in range(width):
+            v_t = kernel[radius, radius] * v_r[i, j]
+            for l in range(len(kernel)):  # noqa: E741
+                for s in range(len(kernel)):
+                    if l == s == radius:
+                        continue
+                    neighbour = padded[i + l, j + s]
+                    if v_t @ neighbour > 0:
+                        v_t = v_t + kernel[l, s] * neighbour
+                    else:
+                        v_t = v_t - kernel[l, s] * neighbour
+            v_o[i, j] = v_t
+    return v_o
