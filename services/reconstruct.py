@@ -1,0 +1,157 @@
+"""`suturetrack reconstruct`: one stereo pair and one seed to one curve, as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+import tyro
+
+from suturetrack import nurbs
+from suturetrack.calibration import load_calibration
+from suturetrack.camera import StereoRig
+from suturetrack.initialization import (
+    Initialization,
+    InitializationConfig,
+    InitializationError,
+    initialize,
+)
+from suturetrack.segmentation import SegmentationConfig, Segmenter
+from suturetrack.types import Image, InputError, Seed, Stamp, StereoFrame
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """Finds the thread of one stereo pair and writes it as one JSON object.
+
+    Members: degree, knots, control_points (x y z in the calibration's unit, rectified left frame),
+    weights, length (the same unit), reprojection_px (mean distance from the ridge, both views),
+    confidence (0 to 1; not to be relied on below 0.5) and reasons.
+    """
+
+    left: Annotated[Path, tyro.conf.Positional]
+    """Left image, or the side-by-side image."""
+    right: Annotated[Path | None, tyro.conf.Positional] = None
+    """Right image; left out with --layout side-by-side."""
+    _: KW_ONLY
+    calibration: Path
+    """Calibration of the rig."""
+    seed: tuple[float, float]
+    """U V: a pixel on the thread in the raw left image."""
+    output: Path
+    """The file to write."""
+    layout: Literal["pair", "side-by-side"] = "pair"
+    """Two images, or one whose left half is the left view."""
+    unit: Literal["m", "mm"] | None = None
+    """Unit of the calibration; guessed from the baseline when not given."""
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    initialization: InitializationConfig = field(default_factory=InitializationConfig)
+
+
+def run(config: ReconstructConfig) -> None:
+    """Reconstructs the thread and writes the file.
+
+    Raises:
+        InputError: the images, the calibration or the seed are at fault, or no thread is found; no
+            file is written.
+    """
+    left, right = _load(config)
+    rig = load_calibration(config.calibration, config.unit)
+    _check(left, right, rig)
+    frame = StereoFrame(Stamp(0, 0, 0), left, right)
+    seed = Seed(pixel=config.seed)
+    segmenter = Segmenter(rig, config.segmentation)
+    segmenter.learn(frame, seed)
+    try:
+        found = initialize(segmenter.step(frame), rig, seed, config.initialization)
+    except InitializationError as error:
+        raise InputError(error.reason + _saturation(left, right)) from error
+    _write(config.output, record(found))
+
+
+def record(found: Initialization) -> dict[str, Any]:
+    """The JSON object of an initialisation."""
+    curve = found.curve
+    return {
+        "degree": curve.degree,
+        "knots": curve.knots.tolist(),
+        "control_points": curve.control_points.tolist(),
+        "weights": curve.weights.tolist(),
+        "length": nurbs.length(curve),
+        "reprojection_px": found.reprojection_px,
+        "confidence": found.confidence,
+        "reasons": list(found.reasons),
+    }
+
+
+def _load(config: ReconstructConfig) -> tuple[Image, Image]:
+    if config.layout == "side-by-side":
+        if config.right is not None:
+            raise InputError("--layout side-by-side takes one image; leave the right one out")
+        both = _read(config.left)
+        if both.shape[1] % 2:
+            raise InputError(
+                f"{config.left}: {both.shape[1]} columns do not halve; is it side by side?"
+            )
+        middle = both.shape[1] // 2
+        return np.ascontiguousarray(both[:, :middle]), np.ascontiguousarray(both[:, middle:])
+    if config.right is None:
+        raise InputError("give LEFT and RIGHT, or one image and --layout side-by-side")
+    return _read(config.left), _read(config.right)
+
+
+def _read(path: Path) -> Image:
+    if not path.is_file():
+        raise InputError(f"no image {path}")
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None or image.size == 0:
+        raise InputError(f"{path}: no image that can be read; use PNG, JPEG, TIFF or BMP")
+    if image.dtype != np.uint8:
+        raise InputError(f"{path}: {image.dtype} pixels; convert the image to 8 bit")
+    return np.ascontiguousarray(image[..., :3]) if image.ndim == 3 else image
+
+
+def _check(left: Image, right: Image, rig: StereoRig) -> None:
+    if left.ndim != right.ndim:
+        raise InputError("one image is gray and the other in colour; both must be alike")
+    if left.shape != right.shape:
+        raise InputError(
+            f"the images differ in size: left {_size(left)}, right {_size(right)}; "
+            "give a pair of one camera setting"
+        )
+    width, height = rig.image_size
+    if left.shape[:2] != (height, width):
+        raise InputError(
+            f"the images are {_size(left)}, the calibration is for {width}x{height}; "
+            "use the calibration of this size"
+        )
+    for name, image in (("left", left), ("right", right)):
+        if int(image.max()) == int(image.min()):
+            raise InputError(f"the {name} image is empty: every pixel is {int(image.max())}")
+
+
+def _saturation(left: Image, right: Image) -> str:
+    """What to add to a refusal where the images are overexposed."""
+    share = max(float((image == 255).mean()) for image in (left, right))
+    return f"; {share:.0%} of the pixels are saturated: lower the exposure" if share > 0.5 else ""
+
+
+def _size(image: Image) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def _write(path: Path, value: dict[str, Any]) -> None:
+    """Writes the file whole or not at all."""
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        unfinished.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        unfinished.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
