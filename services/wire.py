@@ -118,6 +118,16 @@ def encode(message: object, publisher: str = "", number: int = 0, sent_ns: int =
     return Packet(encoding_of(kind), payload, _ENCODER.encode(header))
 
 
+def decode_header(packet: Packet) -> Header:
+    """The header alone; raises WireError."""
+    if len(packet.attachment) > LARGEST_SMALL_MESSAGE:
+        raise WireError(f"header of {len(packet.attachment)} bytes")
+    try:
+        return _HEADER_DECODER.decode(packet.attachment)
+    except (ValueError, RecursionError) as error:
+        raise WireError(f"header: {error}") from error
+
+
 def decode(packet: Packet, kind: type[T]) -> tuple[T, Header]:
     """A message of the expected type, checked, and its header.
 
@@ -126,10 +136,8 @@ def decode(packet: Packet, kind: type[T]) -> tuple[T, Header]:
     """
     if packet.encoding != encoding_of(kind):
         raise WireError(f"encoding {packet.encoding[:80]!r}, expected {encoding_of(kind)!r}")
-    if len(packet.attachment) > LARGEST_SMALL_MESSAGE:
-        raise WireError(f"header of {len(packet.attachment)} bytes")
+    header = decode_header(packet)
     try:
-        header = _HEADER_DECODER.decode(packet.attachment)
         raw = kind in _RAW
         message = _decode_raw(packet, kind, header) if raw else _decode_small(packet, kind)
         checks.check(message)

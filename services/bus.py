@@ -1,0 +1,284 @@
+"""How processes talk: publish and read topics, ask and answer questions, see who is alive.
+
+The face is the same over Zenoh (`services.zenoh_transport`) and within one process
+(`services.memory_transport`).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, Protocol, TypeVar
+
+from services import topics, wire
+from services.inbox import Inbox, Stop
+from services.topics import Question, Topic
+from services.wire import Packet, WireError
+
+T = TypeVar("T")
+Q = TypeVar("Q")
+A = TypeVar("A")
+
+DEPTH = 1024
+"""Messages that wait for a reader of every one before the oldest is given up, and counted."""
+_MOST_PUBLISHERS = 256
+_POLL_S = 0.02
+
+Deliver = Callable[[str, Packet], None]
+Reply = Callable[[Packet | str], None]
+"""Answers a question once: with a packet, or with the reason why there is no answer."""
+
+
+class NoAnswer(Exception):
+    """Nobody answered a question, or the one who should have refused it; the text says why."""
+
+
+class Transport(Protocol):
+    """What carries packets; keys are full keys or key expressions."""
+
+    def put(self, key: str, packet: Packet, *, large: bool) -> None:
+        """Sends to all subscribers and does not wait for them."""
+
+    def subscribe(self, pattern: str, deliver: Deliver) -> None:
+        """Calls `deliver(key, packet)` from another thread for every packet that arrives."""
+
+    def has_readers(self, key: str) -> bool:
+        """Whether somebody subscribes to the key."""
+
+    def serve(self, pattern: str, deliver: Callable[[str, Packet, Reply], None]) -> None:
+        """Calls `deliver(key, question, reply)` from another thread for every question."""
+
+    def ask(self, key: str, packet: Packet, timeout: float) -> Packet:
+        """The first answer; raises NoAnswer."""
+
+    def declare_alive(self, key: str) -> None:
+        """Lets others see this process until it closes or dies."""
+
+    def watch_alive(self, pattern: str, changed: Callable[[str, bool], None]) -> None:
+        """Calls `changed(key, alive)` from another thread for those alive now, and on changes."""
+
+    def close(self) -> None:
+        """Ends everything; safe to call twice."""
+
+
+class Reader(Generic[T]):
+    """A subscription; iterating gives valid messages and ends when the process is asked to stop.
+
+    What was sent equals what was read plus `passed_over`, `lost`, `refused` and what still waits.
+    """
+
+    def __init__(self, bus: Bus, topic: Topic[T], depth: int):
+        self._bus, self._topic = bus, topic
+        self._inbox: Inbox[tuple[str, Packet]] = Inbox(bus.stop, depth)
+        self._next: dict[tuple[str, str], int] = {}
+        self.lost = 0
+        """Messages that were sent and did not arrive, by the gaps in their numbers."""
+        self.refused = 0
+        """Bad messages."""
+
+    @property
+    def passed_over(self) -> int:
+        """Messages that had to make room for newer ones."""
+        return self._inbox.given_up
+
+    @property
+    def dropped(self) -> int:
+        """Messages that were sent and never read, bad ones aside."""
+        return self.lost + self.passed_over
+
+    def deliver(self, key: str, packet: Packet) -> None:
+        """Takes a packet from the transport."""
+        try:
+            header = wire.decode_header(packet)
+        except WireError as error:
+            self._refuse(key, error)
+            return
+        sender = (key, header.publisher)
+        if len(self._next) >= _MOST_PUBLISHERS and sender not in self._next:
+            self._next.clear()
+        self.lost += max(0, header.number - self._next.get(sender, header.number))
+        self._next[sender] = header.number + 1
+        self._inbox.put((key, packet))
+
+    def get(self, timeout: float | None = None) -> T | None:
+        """The next valid message; None after `timeout` seconds without one, or when stopped."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            left = None if deadline is None else max(0.0, deadline - time.monotonic())
+            item = self._inbox.get(left)
+            if item is None:
+                return None
+            try:
+                return self._bus.open(self._topic, *item)
+            except WireError as error:
+                self._refuse(item[0], error)
+
+    def __iter__(self) -> Iterator[T]:
+        while (message := self.get()) is not None:
+            yield message
+
+    def _refuse(self, key: str, error: WireError) -> None:
+        self.refused += 1
+        self._bus.complain(f"refused a message on {key}: {error}")
+
+
+class Request(Generic[Q, A]):
+    """A question that waits for its answer."""
+
+    def __init__(self, question: Q, reply: Callable[[A], None]):
+        self.question = question
+        self.answer = reply
+        """Sends the answer; to be called once."""
+
+
+class Bus:
+    """One process's connection to a rig."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        rig: str,
+        process: str,
+        complain: Callable[[str], None] = lambda _: None,
+    ):
+        self.stop = Stop()
+        self.process = process
+        self.complain = complain
+        self.readers: list[Reader[Any]] = []
+        self.refused_questions = 0
+        self._transport = transport
+        self._root = topics.root(rig)
+        self._publisher = f"{process}-{uuid.uuid4().hex[:8]}"
+        self._numbers: defaultdict[str, int] = defaultdict(int)
+        self._alive: set[str] | None = None
+
+    @property
+    def dropped(self) -> int:
+        """Messages that were sent to this process and never read."""
+        return sum(reader.dropped for reader in self.readers)
+
+    @property
+    def refused(self) -> int:
+        """Bad messages and questions so far."""
+        return self.refused_questions + sum(reader.refused for reader in self.readers)
+
+    def publish(self, topic: Topic[T], message: T) -> None:
+        """Sends a message to everyone who reads the topic now; waits for nobody."""
+        key = f"{self._root}/{topics.key_of(topic, message)}"
+        number = self._numbers[key]
+        self._numbers[key] += 1
+        packet = wire.encode(message, self._publisher, number, time.time_ns())
+        self._transport.put(key, packet, large=topic.keep == "newest")
+
+    def newest(self, topic: Topic[T]) -> Reader[T]:
+        """Reads the newest message each time, passing over those that came in between."""
+        return self._read(topic, 1)
+
+    def every(self, topic: Topic[T]) -> Reader[T]:
+        """Reads every message in order."""
+        return self._read(topic, DEPTH)
+
+    def wait_for_readers(self, topic: Topic[Any], timeout: float | None = None) -> bool:
+        """Waits until somebody reads the topic; False after the time-out or when stopped."""
+        key = f"{self._root}/{topics.pattern_of(topic)}"
+        return self._wait(lambda: self._transport.has_readers(key), timeout)
+
+    def ask(self, question: Question[Q, A], content: Q, timeout: float) -> A:
+        """Asks and waits for the answer.
+
+        Raises:
+            NoAnswer: nobody there, no answer in time, or a refusal.
+        """
+        key = f"{self._root}/{topics.key_of(question, content)}"
+        packet = self._transport.ask(key, wire.encode(content, self._publisher), timeout)
+        try:
+            return wire.decode(packet, question.answer)[0]
+        except WireError as error:
+            raise NoAnswer(f"{question.server} sent a bad answer: {error}") from error
+
+    def ask_until_answered(self, question: Question[Q, A], content: Q) -> A | None:
+        """Asks again until there is an answer; None when stopped."""
+        answers: list[A] = []
+
+        def answered() -> bool:
+            try:
+                answers.append(self.ask(question, content, timeout=1.0))
+            except NoAnswer:
+                return False
+            return True
+
+        return answers[0] if self._wait(answered, None) else None
+
+    def requests(self, question: Question[Q, A]) -> Inbox[Request[Q, A]]:
+        """The questions that come in, to be answered one by one."""
+        inbox: Inbox[Request[Q, A]] = Inbox(self.stop, DEPTH)
+
+        def deliver(key: str, packet: Packet, reply: Reply) -> None:
+            try:
+                content = self.open(question, key, packet)
+            except WireError as error:
+                self.refused_questions += 1
+                self.complain(f"refused a question on {key}: {error}")
+                reply(str(error))
+            else:
+                inbox.put(Request(content, lambda answer: reply(wire.encode(answer))))
+
+        self._transport.serve(f"{self._root}/{topics.pattern_of(question)}", deliver)
+        return inbox
+
+    def answer(self, question: Question[Q, A], function: Callable[[Q], A]) -> None:
+        """Answers a question by a quick function, beside the process's own loop."""
+        requests = self.requests(question)
+
+        def loop() -> None:
+            for request in requests:
+                request.answer(function(request.question))
+
+        threading.Thread(target=loop, name=f"answer {question.key}", daemon=True).start()
+
+    def declare_alive(self) -> None:
+        """Lets others see that this process is ready."""
+        self._transport.declare_alive(f"{self._root}/{topics.alive(self.process)}")
+
+    def wait_for_alive(self, process: str, timeout: float | None = None) -> bool:
+        """Waits until a process is ready; False after the time-out or when stopped."""
+        return self._wait(lambda: process in self.alive(), timeout)
+
+    def alive(self) -> set[str]:
+        """Names of the processes that are ready; the first call starts to look for them."""
+        if self._alive is None:
+            found = self._alive = set()
+            self._transport.watch_alive(
+                f"{self._root}/{topics.alive('*')}",
+                lambda key, alive: (found.add if alive else found.discard)(key.rsplit("/", 1)[1]),
+            )
+        return set(self._alive)
+
+    def close(self) -> None:
+        """Ends every loop and the connection."""
+        self.stop.set()
+        self._transport.close()
+
+    def open(self, topic: Topic[T] | Question[T, Any], key: str, packet: Packet) -> T:
+        """The message in a packet; raises WireError."""
+        message, _ = wire.decode(packet, topic.kind)
+        if key != f"{self._root}/{topics.key_of(topic, message)}":
+            raise WireError("the key names something else than the message")
+        return message
+
+    def _read(self, topic: Topic[T], depth: int) -> Reader[T]:
+        reader = Reader(self, topic, depth)
+        self.readers.append(reader)
+        self._transport.subscribe(f"{self._root}/{topics.pattern_of(topic)}", reader.deliver)
+        return reader
+
+    def _wait(self, condition: Callable[[], bool], timeout: float | None) -> bool:
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while not condition():
+            late = deadline is not None and time.monotonic() >= deadline
+            if late or self.stop.wait(_POLL_S):
+                return False
+        return True

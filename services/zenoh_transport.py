@@ -1,0 +1,283 @@
+"""Packets over Zenoh.
+
+By default the processes of a rig are peers on this machine: each of the processes that all others
+need listens on a Unix socket of its own in a directory private to the user, and everyone connects to
+the sockets of those that stand before it in `LISTENERS`, trying again until they are there. So they
+start in any order, and nothing can be reached from another machine. A Zenoh configuration file
+replaces all of this.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from zenoh.shm import GarbageCollect, ShmProvider, ZShmMut
+
+from services.bus import Deliver, NoAnswer, Reply
+from services.wire import Packet
+from suturetrack.types import InputError
+
+LISTENERS = ("source", "segmenter", "tracker", "run")
+_LONGEST_SOCKET_PATH = 107
+_CLOSED = {
+    "mode": "peer",
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "scouting/delay": 0,
+    "listen/endpoints": [],
+    "transport/shared_memory/enabled": True,
+    "transport/shared_memory/mode": "init",
+    "transport/shared_memory/transport_optimization/enabled": False,
+}
+"""A peer that is connected to nobody."""
+_POOLED = 8
+"""Messages of one publisher that fit into its shared memory at the same time."""
+_LARGEST_MESSAGE = 256 << 20
+
+
+def socket_directory(rig: str) -> Path:
+    """The directory that holds the sockets of a rig; made when it is not there.
+
+    Raises:
+        InputError: it cannot be made, or others could reach into it.
+    """
+    runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
+    if runtime.is_absolute() and os.access(runtime, os.W_OK):
+        base = runtime / "suturetrack"
+    else:
+        base = Path(f"/tmp/suturetrack-{os.getuid()}")
+    try:
+        for directory in (base, base / rig):
+            directory.mkdir(mode=0o700, exist_ok=True)
+            found = directory.lstat()
+            if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+                raise InputError(f"{directory} belongs to somebody else; remove it")
+            if found.st_mode & 0o077:
+                raise InputError(f"others may enter {directory}; run: chmod 700 {directory}")
+    except OSError as error:
+        raise InputError(f"no directory for sockets: {error}") from error
+    return base / rig
+
+
+def remove_sockets(rig: str) -> None:
+    """Removes the sockets that killed processes of a rig left behind; no process of it may run."""
+    directory = socket_directory(rig)
+    for path in directory.iterdir():
+        path.unlink(missing_ok=True)
+    directory.rmdir()
+
+
+def local_config(rig: str, process: str) -> zenoh.Config:
+    """The default: peers on this machine only, over Unix sockets and shared memory."""
+    directory = socket_directory(rig)
+
+    def endpoint(name: str) -> str:
+        path = directory / f"{name}.sock"
+        if len(str(path)) > _LONGEST_SOCKET_PATH:
+            raise InputError(f"rig {rig!r}: the socket's path {path} is too long; use a short name")
+        return f"unixsock-stream/{path}"
+
+    place = LISTENERS.index(process) if process in LISTENERS else len(LISTENERS)
+    settings = {
+        **_CLOSED,
+        "listen/endpoints": [endpoint(process)] if process in LISTENERS else [],
+        "connect/endpoints": [endpoint(name) for name in LISTENERS[:place]],
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": {
+            "period_init_ms": 50,
+            "period_max_ms": 200,
+            "period_increase_factor": 2,
+        },
+        "transport/link/rx/max_message_size": _LARGEST_MESSAGE,
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def load_config(path: Path) -> zenoh.Config:
+    """A Zenoh configuration file; raises InputError."""
+    if not path.is_file():
+        raise InputError(f"zenoh: no file {path}")
+    try:
+        return zenoh.Config.from_file(str(path))
+    except zenoh.ZError as error:
+        raise InputError(f"zenoh {path}: {_first_line(error)}") from error
+
+
+def sweep_shared_memory() -> None:
+    """Removes the shared memory of processes that have ended; Zenoh does so when it opens."""
+    config = zenoh.Config()
+    for key, value in _CLOSED.items():
+        config.insert_json5(key, json.dumps(value))
+    zenoh.open(config).close()  # type: ignore[no-untyped-call]
+
+
+class ZenohTransport:
+    """A `services.bus.Transport` over a Zenoh session.
+
+    Args:
+        config: where to listen and to connect.
+        patient: wait for slow readers instead of dropping what they cannot take; for lock-step.
+
+    Raises:
+        InputError: the session cannot be opened.
+    """
+
+    def __init__(self, config: zenoh.Config, *, patient: bool = False):
+        zenoh.init_log_from_env_or("error")
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise InputError(_explain(error)) from error
+        control = zenoh.CongestionControl
+        self._congestion = control.BLOCK if patient else control.DROP
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._kept: list[object] = []
+        self._pool: ShmProvider | None = None
+        self._pooled_size = 0
+
+    def put(self, key: str, packet: Packet, *, large: bool) -> None:
+        """See `Transport`."""
+        payload = bytes(packet.payload)
+        content = self._share(payload) if large else payload
+        publisher = self._publisher(key, large=large)
+        publisher.put(content, encoding=packet.encoding, attachment=packet.attachment)
+
+    def subscribe(self, pattern: str, deliver: Deliver) -> None:
+        """See `Transport`."""
+
+        def arrived(sample: zenoh.Sample) -> None:
+            deliver(str(sample.key_expr), _packet(sample))
+
+        self._kept.append(self._session.declare_subscriber(pattern, arrived))
+
+    def has_readers(self, key: str) -> bool:
+        """See `Transport`."""
+        status: Any = self._publisher(key, large=True).matching_status  # its stub says bool
+        return bool(status.matching)
+
+    def serve(self, pattern: str, deliver: Callable[[str, Packet, Reply], None]) -> None:
+        """See `Transport`."""
+
+        def arrived(query: zenoh.Query) -> None:
+            key = str(query.key_expr)
+
+            def reply(answer: Packet | str) -> None:
+                with query:
+                    if isinstance(answer, str):
+                        query.reply_err(answer)
+                    else:
+                        query.reply(
+                            key,
+                            answer.payload,
+                            encoding=answer.encoding,
+                            attachment=answer.attachment,
+                        )
+
+            deliver(key, _packet(query), reply)
+
+        self._kept.append(self._session.declare_queryable(pattern, arrived))
+
+    def ask(self, key: str, packet: Packet, timeout: float) -> Packet:
+        """See `Transport`."""
+        replies = self._session.get(
+            key,
+            payload=packet.payload,
+            encoding=packet.encoding,
+            attachment=packet.attachment,
+            timeout=timeout,
+        )
+        refusal = f"nobody answers {key}"
+        for reply in replies:
+            if reply.ok is not None:
+                return _packet(reply.ok)
+            if reply.err is not None:
+                refusal = str(reply.err.payload)
+        raise NoAnswer(refusal)
+
+    def declare_alive(self, key: str) -> None:
+        """See `Transport`."""
+        self._kept.append(self._session.liveliness().declare_token(key))
+
+    def watch_alive(self, pattern: str, changed: Callable[[str, bool], None]) -> None:
+        """See `Transport`."""
+
+        def arrived(sample: zenoh.Sample) -> None:
+            changed(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        watcher = self._session.liveliness().declare_subscriber(pattern, arrived, history=True)
+        self._kept.append(watcher)
+
+    def close(self) -> None:
+        """See `Transport`."""
+        if not self._session.is_closed():
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def _share(self, payload: bytes) -> bytes | ZShmMut:
+        """The payload in shared memory; itself where there is none, or no room in it."""
+        if len(payload) > self._pooled_size:
+            self._pooled_size = len(payload)
+            self._pool = _make_pool(_POOLED * len(payload))
+        if self._pool is None:
+            return payload
+        try:
+            buffer = self._pool.alloc(len(payload), policy=GarbageCollect())
+        except zenoh.ZError:
+            return payload
+        buffer[:] = payload
+        return buffer
+
+    def _publisher(self, key: str, *, large: bool) -> zenoh.Publisher:
+        if key not in self._publishers:
+            urgent = zenoh.Priority.INTERACTIVE_HIGH
+            self._publishers[key] = self._session.declare_publisher(
+                key,
+                congestion_control=self._congestion,
+                priority=zenoh.Priority.DATA if large else urgent,
+                express=not large,
+                reliability=zenoh.Reliability.RELIABLE,
+            )
+        return self._publishers[key]
+
+
+def _make_pool(size: int) -> ShmProvider | None:
+    try:
+        if shutil.disk_usage("/dev/shm").free < 2 * size:
+            return None
+        return ShmProvider.default_backend(size)
+    except (OSError, zenoh.ZError):
+        return None
+
+
+def _packet(message: zenoh.Sample | zenoh.Query) -> Packet:
+    payload, attachment = message.payload, message.attachment
+    return Packet(
+        str(message.encoding),
+        b"" if payload is None else payload,
+        b"" if attachment is None else attachment.to_bytes(),
+    )
+
+
+def _explain(error: zenoh.ZError) -> str:
+    text = _first_line(error)
+    if "Unable to acquire lock" in text:
+        socket = Path(text.partition(" listener on ")[2].partition(" - ")[0])
+        return (
+            f"rig {socket.parent.name!r}: a process named {socket.stem!r} is running already; "
+            "stop it, or give another --rig"
+        )
+    return f"zenoh: {text}"
+
+
+def _first_line(error: zenoh.ZError) -> str:
+    return str(error).splitlines()[0].partition(" at /")[0]

@@ -1,0 +1,373 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from services import topics, wire
+from services.bus import Bus, NoAnswer, Transport
+from services.memory_transport import Hub
+from services.messages import SeedReply
+from services.wire import Packet
+from services.zenoh_transport import (
+    ZenohTransport,
+    load_config,
+    local_config,
+    remove_sockets,
+    socket_directory,
+)
+from suturetrack.types import InputError, Seed, Stamp, StereoFrame
+
+Connect = Callable[[str], Bus]
+
+
+@pytest.fixture(params=["memory", "zenoh"])
+def connect(request: pytest.FixtureRequest, rig: str) -> Iterator[Connect]:
+    """Opens buses of one rig; closes them at the end."""
+    hub, buses = Hub(), list[Bus]()
+
+    def transport(process: str) -> Transport:
+        if request.param == "memory":
+            return hub.connect()
+        return ZenohTransport(local_config(rig, process))
+
+    def open_bus(process: str) -> Bus:
+        buses.append(Bus(transport(process), rig, process))
+        return buses[-1]
+
+    yield open_bus
+    for bus in buses:
+        bus.close()
+    if request.param == "zenoh":
+        remove_sockets(rig)
+
+
+def stamp(frame: int) -> Stamp:
+    return Stamp(frame, frame * 33_000_000, time.time_ns())
+
+
+def until(condition: Callable[[], bool], seconds: float = 10) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.005)
+
+
+def test_every_reader_gets_all_in_order(connect: Connect) -> None:
+    tracker, source = connect("tracker"), connect("source")
+    reader = source.every(topics.STEP)
+    assert tracker.wait_for_readers(topics.STEP, 10)
+    for frame in range(500):
+        tracker.publish(topics.STEP, stamp(frame))
+    got = [reader.get(10) for _ in range(500)]
+    assert [s.frame for s in got if s] == list(range(500))
+    assert reader.dropped == reader.refused == 0
+
+
+def test_a_reader_of_the_newest_passes_over_the_rest_and_counts_them(connect: Connect) -> None:
+    tracker, source = connect("tracker"), connect("source")
+    reader = source.newest(topics.STEP)
+    assert tracker.wait_for_readers(topics.STEP, 10)
+    for frame in range(100):
+        tracker.publish(topics.STEP, stamp(frame))
+    until(lambda: reader.passed_over == 99)
+    newest = reader.get(1)
+    assert newest is not None
+    assert newest.frame == 99
+    assert reader.get(0.01) is None
+    assert (reader.dropped, reader.lost) == (99, 0)
+
+
+def test_images_cross_unchanged(connect: Connect) -> None:
+    source, segmenter = connect("source"), connect("segmenter")
+    left, right = np.random.default_rng(0).integers(0, 256, (2, 480, 640, 3), dtype=np.uint8)
+    reader = segmenter.newest(topics.FRAME)
+    assert source.wait_for_readers(topics.FRAME, 10)
+    source.publish(topics.FRAME, StereoFrame(stamp(3), left, right))
+    frame = reader.get(10)
+    assert frame is not None
+    np.testing.assert_array_equal(frame.left, left)
+    np.testing.assert_array_equal(frame.right, right)
+
+
+def test_iteration_ends_when_stopped(connect: Connect) -> None:
+    reader = connect("segmenter")
+    frames = reader.newest(topics.FRAME)
+    ended = threading.Event()
+
+    def loop() -> None:
+        for _ in frames:
+            pass
+        ended.set()
+
+    threading.Thread(target=loop, daemon=True).start()
+    assert not ended.is_set()
+    reader.stop.set()
+    assert ended.wait(1)
+    assert frames.get() is None
+    assert not reader.wait_for_readers(topics.FIELD)
+
+
+def test_nobody_reads_at_first(connect: Connect) -> None:
+    source = connect("source")
+    assert not source.wait_for_readers(topics.FRAME, 0.1)
+    assert not source.wait_for_alive("tracker", 0.1)
+
+
+def test_questions_are_answered(connect: Connect) -> None:
+    tracker, console = connect("tracker"), connect("console")
+    tracker.answer(topics.SEED, lambda seed: SeedReply(seed.thread, True, f"at {seed.pixel}"))
+    seed = Seed("left", pixel=(3.0, 4.0))
+    reply = console.ask_until_answered(topics.SEED, seed)
+    assert reply == SeedReply("left", True, "at (3.0, 4.0)")
+
+
+def test_a_question_to_nobody_fails_at_once(connect: Connect) -> None:
+    console = connect("console")
+    began = time.monotonic()
+    with pytest.raises(NoAnswer, match="nobody answers"):
+        console.ask(topics.SEED, Seed("0", pixel=(1.0, 1.0)), timeout=5)
+    assert time.monotonic() - began < 2
+
+
+def test_a_question_without_an_answer_in_time_fails(connect: Connect) -> None:
+    tracker, console = connect("tracker"), connect("console")
+    requests = tracker.requests(topics.SEED)
+    tracker.declare_alive()
+    assert console.wait_for_alive("tracker", 10)
+    with pytest.raises(NoAnswer):
+        console.ask(topics.SEED, Seed("0", pixel=(1.0, 1.0)), timeout=0.2)
+    assert requests.get(1) is not None
+
+
+def test_those_alive_are_seen_to_come_and_go(connect: Connect) -> None:
+    tracker, run = connect("tracker"), connect("run")
+    assert not run.alive()
+    tracker.declare_alive()
+    assert run.wait_for_alive("tracker", 10)
+    tracker.close()
+    until(lambda: not run.alive())
+
+
+def put(bus: Bus, key: str, packet: Packet) -> None:
+    bus._transport.put(f"suturetrack/test/{key}", packet, large=False)
+
+
+def test_bad_messages_are_refused_counted_and_passed(connect: Connect) -> None:
+    tracker, source = connect("tracker"), connect("source")
+    complaints = list[str]()
+    source.complain = complaints.append
+    reader = source.every(topics.STEP)
+    assert tracker.wait_for_readers(topics.STEP, 10)
+    good = wire.encode(stamp(1))
+    put(tracker, "step", Packet(good.encoding, b"\xff garbage", good.attachment))
+    put(tracker, "step", Packet("application/msgpack;stamp/9", good.payload, good.attachment))
+    put(tracker, "step", Packet(good.encoding, good.payload, b"no header"))
+    put(tracker, "step", Packet(good.encoding, b"", b""))
+    tracker.publish(topics.STEP, stamp(2))
+    got = reader.get(10)
+    assert got is not None
+    assert got.frame == 2
+    assert reader.refused == source.refused == len(complaints) == 4
+    assert any("stamp/9" in line and "stamp/1" in line for line in complaints)
+
+
+def test_a_message_under_the_key_of_another_thread_is_refused(connect: Connect) -> None:
+    tracker, segmenter = connect("tracker"), connect("segmenter")
+    reader = segmenter.every(topics.SEEDING)
+    assert tracker.wait_for_readers(topics.SEEDING, 10)
+    put(tracker, "thread/1/seeding", wire.encode(Seed("0", pixel=(1.0, 1.0))))
+    tracker.publish(topics.SEEDING, Seed("1", pixel=(2.0, 2.0)))
+    got = reader.get(10)
+    assert got is not None
+    assert (got.thread, reader.refused) == ("1", 1)
+
+
+def test_bad_questions_are_refused_with_the_reason(connect: Connect) -> None:
+    tracker, console = connect("tracker"), connect("console")
+    tracker.answer(topics.SEED, lambda seed: SeedReply(seed.thread, True, ""))
+    assert console.ask_until_answered(topics.SEED, Seed("0", pixel=(1.0, 1.0)))
+    bad = wire.encode(Seed("0", pixel=(float("nan"), 1.0)))
+    with pytest.raises(NoAnswer, match="not finite"):
+        console._transport.ask("suturetrack/test/thread/0/seed", bad, 5)
+    assert tracker.refused == 1
+
+
+def test_gaps_in_the_numbers_are_lost_messages(connect: Connect) -> None:
+    tracker, source = connect("tracker"), connect("source")
+    reader = source.every(topics.STEP)
+    assert tracker.wait_for_readers(topics.STEP, 10)
+    for number in (5, 6, 9):
+        put(tracker, "step", wire.encode(stamp(number), "tracker-1", number))
+    assert all(reader.get(10) for _ in range(3))
+    assert (reader.lost, reader.passed_over) == (2, 0)
+
+
+def test_another_rig_hears_nothing(rig: str) -> None:
+    with_hub = Hub()
+    here, there = (Bus(with_hub.connect(), name, "source") for name in ("here", "there"))
+    reader = here.every(topics.STEP)
+    there.publish(topics.STEP, stamp(1))
+    assert reader.get(0.05) is None
+
+
+OTHER = """
+import sys, time
+from services import topics
+from services.bus import Bus
+from services.zenoh_transport import ZenohTransport, local_config
+from suturetrack.types import Stamp
+bus = Bus(ZenohTransport(local_config("test", "tracker")), "test", "tracker")
+bus.declare_alive()
+bus.wait_for_readers(topics.STEP)
+for frame in range(10**9):
+    bus.publish(topics.STEP, Stamp(frame, 0, 0))
+    time.sleep(0.01)
+"""
+
+
+def start_other() -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", OTHER])
+
+
+def test_a_killed_process_is_seen_to_die_and_may_come_back(rig: str) -> None:
+    source = Bus(ZenohTransport(local_config(rig, "source")), rig, "source")
+    reader = source.every(topics.STEP)
+    try:
+        for _ in range(2):
+            other = start_other()
+            assert source.wait_for_alive("tracker", 20)
+            assert reader.get(10) is not None
+            other.send_signal(signal.SIGKILL)
+            other.wait()
+            until(lambda: not source.alive())
+            while reader.get(0.05):
+                pass
+    finally:
+        source.close()
+        remove_sockets(rig)
+
+
+def test_a_second_process_of_one_name_is_told_so(rig: str) -> None:
+    first = ZenohTransport(local_config(rig, "source"))
+    try:
+        with pytest.raises(InputError, match=r"rig 'test'.*'source' is running already"):
+            ZenohTransport(local_config(rig, "source"))
+    finally:
+        first.close()
+        remove_sockets(rig)
+
+
+def test_nothing_listens_beyond_this_machine(rig: str) -> None:
+    buses = [ZenohTransport(local_config(rig, name)) for name in ("source", "tracker", "viewer")]
+    try:
+        mine = psutil.Process().net_connections(kind="inet")
+        assert not [c for c in mine if c.status == psutil.CONN_LISTEN or not c.raddr]
+        directory = socket_directory(rig)
+        assert directory.stat().st_mode & 0o077 == 0
+        assert {p.name for p in directory.glob("*.sock")} == {"source.sock", "tracker.sock"}
+    finally:
+        for bus in buses:
+            bus.close()
+        remove_sockets(rig)
+    assert not directory.exists()
+
+
+def test_a_directory_open_to_others_is_refused(rig: str) -> None:
+    directory = socket_directory(rig)
+    directory.chmod(0o755)
+    try:
+        with pytest.raises(InputError, match="chmod 700"):
+            local_config(rig, "source")
+    finally:
+        directory.chmod(0o700)
+        remove_sockets(rig)
+
+
+def test_a_long_rig_name_is_refused(rig: str) -> None:
+    name = "r" * 64
+    deep = Path(os.environ["XDG_RUNTIME_DIR"]) / ("d" * 60)
+    deep.mkdir(exist_ok=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(deep))
+        with pytest.raises(InputError, match="too long"):
+            local_config(name, "source")
+        remove_sockets(name)
+
+
+def test_a_configuration_file_replaces_the_default(tmp_path: Path) -> None:
+    file = tmp_path / "net.json5"
+    file.write_text(
+        '{mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: ["tcp/127.0.0.1:0"]}}'
+    )
+    transport = ZenohTransport(load_config(file))
+    try:
+        ports = [c.laddr.ip for c in psutil.Process().net_connections(kind="tcp")]
+        assert ports == ["127.0.0.1"]
+    finally:
+        transport.close()
+    with pytest.raises(InputError, match="no file"):
+        load_config(tmp_path / "missing.json5")
+    file.write_text('{mode: "pear"}')
+    with pytest.raises(InputError, match=r"net\.json5"):
+        load_config(file)
+
+
+SENDER = """
+import sys
+from services.wire import Packet
+from services.zenoh_transport import ZenohTransport, local_config
+transport = ZenohTransport(local_config("test", "source"))
+while not sys.stdin.closed and sys.stdin.readline():
+    transport.put("big", Packet("x", bytes(1 << 20), b""), large=True)
+"""
+
+
+def test_images_come_through_shared_memory_and_nothing_of_it_stays(rig: str) -> None:
+    sender = subprocess.Popen([sys.executable, "-c", SENDER], stdin=subprocess.PIPE)
+    receiver = ZenohTransport(local_config(rig, "tracker"))
+    shared = list[bool]()
+    receiver.subscribe("big", lambda _, packet: shared.append(_is_shared(packet)))
+    assert sender.stdin
+
+    def arrived() -> bool:
+        assert sender.stdin
+        sender.stdin.write(b"\n")
+        sender.stdin.flush()
+        return bool(shared)
+
+    until(arrived, 20)
+    assert shared[0]
+    files = _mapped(sender.pid)
+    assert files
+    sender.kill()
+    sender.communicate()
+    receiver.close()
+    subprocess.run([sys.executable, "-c", SWEEP], check=True)
+    remove_sockets(rig)
+    # This process keeps its own mappings until it ends.
+    assert not [file for file in files - _mapped(os.getpid()) if file.exists()]
+
+
+SWEEP = "from services.zenoh_transport import sweep_shared_memory; sweep_shared_memory()"
+
+
+def _is_shared(packet: Packet) -> bool:
+    payload: Any = packet.payload
+    return payload.as_shm() is not None
+
+
+def _mapped(pid: int) -> set[Path]:
+    """The shared memory that a process holds."""
+    lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    return {Path(line.split()[-1]) for line in lines if "/dev/shm/" in line}
