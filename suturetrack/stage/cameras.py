@@ -1,0 +1,107 @@
+"""The rigs of the bench top, and where they stand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from suturetrack.camera import StereoRig
+from suturetrack.types import Float64, InputError
+
+
+@dataclass(frozen=True)
+class RigModel:
+    """A stereo camera of the bench top; lengths in mm."""
+
+    focal_px: float
+    """Focal length of images that are 640 px wide; it grows with the width."""
+    baseline: float
+    distances: tuple[float, float]
+    """Nearest and farthest distance of the camera from the thread."""
+
+
+RIGS = {
+    "bench": RigModel(focal_px=800.0, baseline=40.0, distances=(195.0, 200.0)),
+    "endoscope": RigModel(focal_px=880.0, baseline=5.5, distances=(60.0, 120.0)),
+}
+_LARGEST_TILT = np.radians(18.0)
+# Rolls that are tried, from the wished one to both sides, until the scene fits into the images.
+_ROLLS = np.radians(np.r_[0.0, np.repeat(np.arange(10.0, 181.0, 10.0), 2)])
+
+
+def make_rig(name: str, size: tuple[int, int]) -> StereoRig:
+    """The rectified rig with that name, for images of `size` (width, height), in mm.
+
+    Raises:
+        InputError: there is no such rig.
+    """
+    if name not in RIGS:
+        raise InputError(f"no rig {name!r}; use one of {', '.join(RIGS)}")
+    model, (width, height) = RIGS[name], size
+    focal = model.focal_px * width / 640
+    matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    none, shift = np.zeros(5), np.array([-model.baseline, 0.0, 0.0])
+    return StereoRig.from_calibration(size, (matrix, none), (matrix, none), np.eye(3), shift, 1e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """The pose of the table (x and y in its plane, z up, mm) in the rectified left frame."""
+
+    rotation: Float64
+    """(3, 3) left_from_table."""
+    translation: Float64
+    """(3,) the table's origin in the left frame."""
+
+    def to_camera(self, points: Float64) -> Float64:
+        """(..., 3) points of the table -> rectified left frame."""
+        return points @ self.rotation.T + self.translation
+
+    def to_table(self, points: Float64) -> Float64:
+        """(..., 3) points of the rectified left frame -> table."""
+        return (points - self.translation) @ self.rotation
+
+
+def choose_viewpoint(
+    rng: np.random.Generator,
+    rig: StereoRig,
+    distances: tuple[float, float],
+    points: Float64,
+    margin: float,
+) -> Viewpoint:
+    """A random view of (N, 3) points of the table that keeps them `margin` inside both images.
+
+    `margin` is a share of the image's height. Where no roll fits, the camera looks from the largest
+    distance and straight down, and some points may be out of view.
+    """
+    tilt, axis = _LARGEST_TILT * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+    roll, near = rng.uniform(0, 2 * np.pi), rng.uniform()
+    centre = (points.max(0) + points.min(0)) / 2
+    signs = np.where(np.arange(len(_ROLLS)) % 2, 1, -1)
+    for share in (1.0, 0.5, 0.0):
+        for distance in np.linspace(distances[0] + near * np.ptp(distances), distances[1], 3):
+            for step in signs * _ROLLS:
+                view = _look_at(centre, rig, float(distance), (axis, share * tilt, roll + step))
+                if _inside(rig, view.to_camera(points), margin):
+                    return view
+    return view
+
+
+def _look_at(
+    centre: Float64, rig: StereoRig, distance: float, angles: tuple[float, float, float]
+) -> Viewpoint:
+    axis, tilt, roll = angles
+    down = np.diag([1.0, -1.0, -1.0])
+    turn = Rotation.from_rotvec(tilt * np.array([np.cos(axis), np.sin(axis), 0.0]))
+    rotation = turn.as_matrix() @ Rotation.from_euler("z", roll).as_matrix() @ down
+    return Viewpoint(rotation, np.array([rig.baseline / 2, 0.0, distance]) - rotation @ centre)
+
+
+def _inside(rig: StereoRig, points: Float64, margin: float) -> bool:
+    size = np.array(rig.image_size)
+    border = margin * size[1]
+    return all(
+        bool(np.all((view > border) & (view < size - 1 - border))) for view in rig.project(points)
+    )
