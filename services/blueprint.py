@@ -4,42 +4,105 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import rerun.blueprint as rrb
 
-from services.drawing import part
+from services.drawing.common import VIEWS, part
+from suturetrack.camera import StereoRig
+from suturetrack.types import Float64
+
+_AHEAD = np.array([0.5, 0.0, 10.0])
+"""What the view of space looks at while no thread is known, in baselines."""
+_EYE = np.array([-0.8, -0.5, -0.4])
+"""Where its eye is from there, in distances to the cameras."""
 
 
-def blueprint(threads: Sequence[str]) -> rrb.Blueprint:
-    """The layout for the given threads ("0" when there is none yet)."""
+def blueprint(
+    threads: Sequence[str], rig: StereoRig, target: Float64 | None = None
+) -> rrb.Blueprint:
+    """The layout for the given threads ("0" when there is none yet).
+
+    `target` is the (3,) point that the view of space looks at, in the rectified left frame; without
+    it, what stands ten baselines before the cameras.
+    """
     names = [part(thread) for thread in threads] or ["0"]
-    images = rrb.Horizontal(_image("left"), _image("right"))
-    space = rrb.Spatial3DView(origin="/rig", name="Space", contents=["/rig/**"])
-
-    def plot(name: str, *quantities: str) -> rrb.TimeSeriesView:
-        contents = [f"/plots/{n}/{q}" for n in names for q in quantities]
-        return rrb.TimeSeriesView(origin="/plots", name=name, contents=contents)
-
-    plots = rrb.Vertical(
-        rrb.StateTimelineView(
-            origin="/plots", name="Status", contents=[f"/plots/{n}/status" for n in names]
-        ),
-        plot("Image energy (-1 is a perfect match)", "energy/image"),
-        plot("End energy", "energy/end"),
-        plot("Length [mm]", "length"),
-        rrb.TimeSeriesView(origin="/plots", name="Latency [ms]", contents=["/plots/latency_ms/**"]),
-    )
-    log = rrb.TextLogView(origin="/log", name="Log", contents=["/log/**"])
+    if target is None:
+        target = rig.baseline * _AHEAD
     return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(images, rrb.Horizontal(space, log), row_shares=[3, 2]),
-            plots,
-            column_shares=[5, 2],
+        rrb.Tabs(
+            rrb.Horizontal(_scene(target), _plots(names), column_shares=[7, 3], name="Tracking"),
+            rrb.Grid(
+                *(_view(view) for view in VIEWS),
+                *(_view(view, "direction", name=f"{view}, direction field") for view in VIEWS),
+                grid_columns=2,
+                name="Segmentation",
+            ),
+            rrb.Horizontal(*(_view(view, "growth/**") for view in VIEWS), name="Initialisation"),
+            _processes(),
+            rrb.TextDocumentView(origin="/run", name="Parameters", contents="/run/**"),
         ),
         rrb.TimePanel(timeline="frame", state="collapsed"),
         collapse_panels=True,
     )
 
 
-def _image(view: str) -> rrb.Spatial2DView:
+def _scene(target: Float64) -> rrb.Container:
+    images = rrb.Horizontal(*(_view(view, "curve") for view in VIEWS))
+    # From the side, with the cameras at one edge and the thread at the other.
+    middle, distance = 0.6 * target, np.linalg.norm(target)
+    eye = rrb.EyeControls3D(
+        position=middle + distance * _EYE, look_target=middle, eye_up=(0, -1, 0)
+    )
+    hidden = ["- /rig/left/image/**", "- /rig/right/image/**", "- /rig/thread/*/tangent"]
+    space = rrb.Spatial3DView(
+        origin="/rig",
+        name="Space",
+        contents=["+ /rig/**", *hidden, "+ /rig/left/image", "+ /rig/right/image"],
+        eye_controls=eye,
+    )
+    return rrb.Vertical(
+        images, rrb.Horizontal(space, _log(), column_shares=[5, 4]), row_shares=[5, 4]
+    )
+
+
+def _plots(names: Sequence[str]) -> rrb.Container:
+    def of_threads(*quantities: str) -> list[str]:
+        return [f"/plots/{name}/{quantity}" for name in names for quantity in quantities]
+
+    return rrb.Vertical(
+        rrb.StateTimelineView(origin="/plots", name="Status", contents=of_threads("status")),
+        _plot(
+            "Energies of the images (best: -1) and of the ends",
+            *of_threads("energy/image", "energy/end"),
+        ),
+        _plot("Length [mm]", *of_threads("length")),
+        _plot("Latency [ms]", "/plots/latency_ms/**"),
+        row_shares=[2, 5, 5, 4],
+    )
+
+
+def _processes() -> rrb.Container:
+    return rrb.Grid(
+        _plot("Rate [1/s]", "/plots/rate_hz/**"),
+        _plot("Latency from the release of the frame [ms]", "/plots/latency_ms/**"),
+        _plot("Frames dropped so far", "/plots/dropped/**"),
+        _plot("Memory [MB]", "/plots/memory_mb/**"),
+        grid_columns=2,
+        name="Processes",
+    )
+
+
+def _plot(name: str, *contents: str) -> rrb.TimeSeriesView:
+    legend = rrb.PlotLegend(rrb.Corner2D.LeftTop)
+    return rrb.TimeSeriesView(origin="/plots", name=name, contents=contents, plot_legend=legend)
+
+
+def _view(view: str, *layers: str, name: str | None = None) -> rrb.Spatial2DView:
     image = f"/rig/{view}/image"
-    return rrb.Spatial2DView(origin=image, name=view, contents=[image, f"{image}/curve"])
+    contents = [image, *(f"{image}/{layer}" for layer in layers)]
+    return rrb.Spatial2DView(origin=image, name=name or view, contents=contents)
+
+
+def _log() -> rrb.TextLogView:
+    columns = rrb.TextLogColumns(timeline_columns=["frame"], text_log_columns=["LogLevel", "Body"])
+    return rrb.TextLogView(origin="/log", name="Log", contents="/log/**", columns=columns)

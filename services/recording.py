@@ -18,12 +18,16 @@ from typing import Any, Self
 import msgspec
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from services import blueprint, drawing
 from services.drawing import Entry, Level
 from services.messages import Health
+from suturetrack import nurbs
 from suturetrack.camera import StereoRig
+from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.types import (
+    Float64,
     InputError,
     RidgeField,
     Stamp,
@@ -79,6 +83,7 @@ class Recorder:
         self._process, self._level, self._rig = process, level, rig
         self._config, self._flush_seconds, self._part_bytes = config, flush_seconds, part_bytes
         self._threads: list[str] = []
+        self._target: Float64 | None = None
         self._stream: rr.RecordingStream | None = None
         self._stamp: Stamp | None = None
         self._flushed = time.monotonic()
@@ -123,13 +128,30 @@ class Recorder:
         if self._stream is None or not states:
             return
         for state in states:
-            self._introduce(state.thread)
+            self._introduce(state)
         stamp, published_ns = states[0].stamp, published_ns or time.time_ns()
         self._write(stamp, drawing.states(states, self._rig, published_ns))
         self._latency(stamp, published_ns)
         for state in states:
             for event in state.events:
                 self.log(f"thread {state.thread}: {event}")
+
+    def initialization(
+        self, stamp: Stamp, thread: str, result: Initialization | InitializationError
+    ) -> None:
+        """Records how a thread was looked for in one field; the timeline `growth` counts the steps."""
+        if self._stream is None:
+            return None
+        for step, entries in enumerate(self._growth(thread, result), 1):
+            self._stream.set_time("growth", sequence=step)
+            self._write(stamp, entries)
+        self._stream.disable_timeline("growth")
+        if isinstance(result, InitializationError):
+            self._write(stamp, drawing.failure(thread, result.candidates, self._rig))
+            self.log(f"thread {thread} not found: {result.reason}", "WARN")
+        else:
+            found = f"thread {thread} found with confidence {result.confidence:.2f}"
+            self.log("; ".join((found, *result.reasons)))
 
     def truth(self, truth: Truth) -> None:
         """Records where a synthetic thread really is."""
@@ -149,7 +171,10 @@ class Recorder:
 
     def log(self, text: str, level: str = "INFO") -> None:
         """Records a line of the process's log (DEBUG, INFO, WARN, ERROR), at the newest frame."""
-        self._write(self._stamp, [(f"/log/{self._process}", rr.TextLog(text, level=level))])
+        self._write(
+            self._stamp,
+            [(f"/log/{self._process}", rr.TextLog(f"{self._process}: {text}", level=level))],
+        )
 
     def flush_if_due(self) -> None:
         """When it is time: sends to the disk what is waiting, begins a new part, looks for trouble."""
@@ -203,12 +228,23 @@ class Recorder:
         latency_ms = ((published_ns or time.time_ns()) - stamp.released_ns) / 1e6
         self._write(stamp, [(f"/plots/latency_ms/{self._process}", rr.Scalars(latency_ms))])
 
-    def _introduce(self, thread: str) -> None:
-        if thread not in self._threads:
-            self._threads.append(thread)
-            self._write_static(drawing.thread_style(thread))
-            if self._stream is not None:
-                self._stream.send_blueprint(blueprint.blueprint(self._threads))
+    def _growth(
+        self, thread: str, result: Initialization | InitializationError
+    ) -> Iterable[list[Entry]]:
+        return () if result.growth is None else drawing.growth(thread, result.growth, self._rig)
+
+    def _introduce(self, state: ThreadState) -> None:
+        assert self._stream is not None
+        if state.thread not in self._threads:
+            self._threads.append(state.thread)
+            self._write_static(drawing.thread_style(state.thread))
+            self._target = None
+        if self._target is None and state.curve is not None:
+            self._target = nurbs.evaluate(state.curve, np.array([0.5]))[0]
+            self._stream.send_blueprint(self._blueprint())
+
+    def _blueprint(self) -> rrb.Blueprint:
+        return blueprint.blueprint(self._threads, self._rig, self._target)
 
     def _open_part(self) -> None:
         """Directs the stream to the next free file; every part explains itself."""
@@ -219,10 +255,10 @@ class Recorder:
             name = self._run_dir / f"{self._process}.{number}.rrd"
         self._path = name
         sink = rr.FileSink(str(name))
-        self._stream.set_sinks(sink, default_blueprint=blueprint.blueprint(self._threads))
+        self._stream.set_sinks(sink, default_blueprint=self._blueprint())
         self._stream.send_recording_name(self._run_dir.name)
         self._stream.reset_time()
-        self._write_static(drawing.rig(self._rig))
+        self._write_static(drawing.cameras(self._rig))
         self._write_static(drawing.process_style(self._process))
         self._write_static(self._about())
         for thread in self._threads:

@@ -132,6 +132,12 @@ class StereoRig:
         )
         return rectified.reshape(np.shape(pixels))
 
+    def raw_pixels(self, pixels: Float64, *, right: bool = False) -> Float64:
+        """(..., 2) rectified pixels of a view -> (..., 2) pixels of its raw image."""
+        if self.is_rectified:
+            return np.asarray(pixels, float)
+        return _distort(self.right if right else self.left, np.asarray(pixels, float))
+
     def triangulate(self, left: Float64, right: Float64) -> Float64:
         """(..., 2) rectified pixels of both views -> (..., 3) points in the rectified left frame.
 

@@ -1,96 +1,40 @@
-"""What each value looks like in a recording: the entity tree, and the archetypes at each entity.
-
-Every function yields `(entity, archetypes...)` and touches no file. Pictures and overlays are in raw
-pixels, points in the calibration's unit, plots in the units that their names carry.
-"""
+"""Curves: over the images, in space, as plots, and as numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
-import cv2
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 
+from services.drawing.common import (
+    AMBER,
+    BLUE,
+    GRAY,
+    GREEN,
+    ORANGE,
+    RED,
+    TURQUOISE,
+    VIEWS,
+    VIOLET,
+    WHITE,
+    Color,
+    Entry,
+    part,
+    series,
+    values,
+)
 from suturetrack import nurbs
-from suturetrack.camera import Camera, StereoRig
-from suturetrack.segmentation import direction_image
-from suturetrack.types import (
-    Bool,
-    Float64,
-    Image,
-    RidgeField,
-    Status,
-    StereoFrame,
-    ThreadState,
-    Truth,
-)
+from suturetrack.camera import StereoRig
+from suturetrack.types import Bool, Float64, Image, Status, ThreadState, Truth
 
-Level = Literal["light", "full"]
-Color = tuple[int, int, int]
-Entry = tuple[Any, ...]
-"""(entity path, archetype, ...)"""
-
-VIEWS = ("left", "right")
-GREEN, RED, AMBER, GRAY, WHITE = (
-    (70, 220, 90),
-    (240, 60, 50),
-    (255, 180, 40),
-    (150, 150, 150),
-    (245, 245, 245),
-)
-STATUS_COLORS = {Status.TRACKING: GREEN, Status.OCCLUDED: AMBER, Status.LOST: RED}
-PROCESS_COLORS = {
-    "source": (90, 160, 250),
-    "segmenter": (200, 130, 240),
-    "tracker": (250, 160, 60),
-}
-_JPEG_QUALITY = 80
+_STATUS_COLORS = {Status.TRACKING: GREEN, Status.OCCLUDED: AMBER, Status.LOST: RED}
 _DENSE = 240
 _DASH = 5
 _ARROWS = 24
 _WORST_SIGMA_PX = 3.0
-
-
-def rig(rig: StereoRig) -> Iterator[Entry]:
-    """The cameras; all of it static."""
-    yield "/rig", rr.ViewCoordinates.RDF
-    poses = (np.zeros(3), np.array([rig.baseline, 0.0, 0.0]))
-    for view, camera, position in zip(VIEWS, (rig.left, rig.right), poses, strict=True):
-        yield f"/rig/{view}", rr.Transform3D(translation=position, mat3x3=camera.rectification)
-        pinhole = rr.Pinhole(
-            image_from_camera=camera.matrix,
-            resolution=rig.image_size,
-            camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=3 * rig.baseline,
-        )
-        yield f"/rig/{view}/image", pinhole
-    yield "/run/calibration", values("Calibration", _calibration(rig))
-
-
-def frame(frame: StereoFrame, level: Level) -> Iterator[Entry]:
-    """Both raw images: JPEG (light), or as they are (full)."""
-    for view, image in zip(VIEWS, (frame.left, frame.right), strict=True):
-        if level == "full":
-            yield (
-                f"/rig/{view}/image",
-                rr.Image(image, color_model="BGR"[: image[0, 0].size] or "L"),
-            )
-        else:
-            yield f"/rig/{view}/image", jpeg(image)
-
-
-def field(field: RidgeField, rig: StereoRig, level: Level) -> Iterator[Entry]:
-    """The direction fields in false colour over the raw image; as numbers too (full)."""
-    for view, vectors in zip(VIEWS, (field.left, field.right), strict=True):
-        picture = unrectified(direction_image(vectors), rig, view)
-        yield f"/rig/{view}/image/direction", jpeg(picture)
-        if level == "full":
-            yield f"/rig/{view}/field", rr.Tensor(vectors, dim_names=("v", "u", "component"))
 
 
 def states(states: Sequence[ThreadState], rig: StereoRig, published_ns: int) -> Iterator[Entry]:
@@ -116,74 +60,14 @@ def truth(truth: Truth) -> Iterator[Entry]:
 
 def thread_style(thread: str) -> Iterator[Entry]:
     """Names, colours and widths of one thread's plots; all of it static."""
-    plots, statuses = f"/plots/{part(thread)}", list(STATUS_COLORS)
-    both = {"left": (90, 160, 250), "right": (250, 130, 60)}
-    yield f"{plots}/energy/image", series(**both)
-    yield f"{plots}/energy/end", series(ends=(200, 130, 240))
-    yield f"{plots}/energy/internal", series(bending=(120, 200, 200))
+    plots, statuses = f"/plots/{part(thread)}", list(_STATUS_COLORS)
+    yield f"{plots}/energy/image", series(left=BLUE, right=ORANGE)
+    yield f"{plots}/energy/end", series(ends=VIOLET)
+    yield f"{plots}/energy/internal", series(bending=TURQUOISE)
     yield f"{plots}/length", series(length=GREEN)
     yield f"{plots}/control_points", series(control_points=RED)
-    colors = [(*c, 255) for c in STATUS_COLORS.values()]
+    colors = [(*c, 255) for c in _STATUS_COLORS.values()]
     yield f"{plots}/status", rr.StateConfiguration(values=statuses, colors=colors)
-
-
-def process_style(process: str) -> Iterator[Entry]:
-    """Names, colours and widths of one process's plots; all of it static."""
-    for quantity in ("latency_ms", "rate_hz", "dropped", "memory_mb"):
-        color = PROCESS_COLORS.get(process, GRAY)
-        yield f"/plots/{quantity}/{process}", series(**{process: color})
-
-
-def series(**colors: Color) -> rr.SeriesLines:
-    """The look of a plot, a line for each name."""
-    names = [name.replace("_", " ") for name in colors]
-    return rr.SeriesLines(names=names, colors=list(colors.values()), widths=[1.5] * len(names))
-
-
-def jpeg(image: Image) -> rr.EncodedImage:
-    """A BGR or gray picture, small."""
-    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    return rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")
-
-
-def values(name: str, numbers: Mapping[str, Any]) -> rr.DynamicArchetype:
-    """Numbers and words as they are, in columns `name:key`; arrays are flattened."""
-    # Arrow arrays made here cost a fifth of those that Rerun would make.
-    columns = {key: pa.array(np.ravel(value)) for key, value in numbers.items()}
-    return rr.DynamicArchetype(name, components=columns)
-
-
-def part(name: str) -> str:
-    """A user's name as one part of an entity path."""
-    return str(rr.escape_entity_path_part(name))
-
-
-def unrectified(picture: Image, rig: StereoRig, view: str) -> Image:
-    """A picture in rectified pixels, redrawn in the pixels of the raw image."""
-    if rig.is_rectified:
-        return picture
-    return cv2.remap(picture, *_rectified_of_raw(rig, view), interpolation=cv2.INTER_NEAREST)
-
-
-@cache
-def _rectified_of_raw(rig: StereoRig, view: str) -> tuple[Any, Any]:
-    width, height = rig.image_size
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
-    rectified = rig.rectify_pixels(grid, right=view == "right").astype(np.float32)
-    maps = cv2.convertMaps(rectified, None, cv2.CV_16SC2, nninterpolation=True)
-    return maps[0], maps[1]
-
-
-def _calibration(rig: StereoRig) -> dict[str, Any]:
-    def numbers(view: str, camera: Camera) -> dict[str, Float64]:
-        return {f"{view}_{name}": value for name, value in vars(camera).items()}
-
-    return {
-        "image_size": rig.image_size,
-        "metres_per_unit": rig.metres_per_unit,
-        **numbers("left", rig.left),
-        **numbers("right", rig.right),
-    }
 
 
 def _overlays(states: Sequence[ThreadState], rig: StereoRig) -> Iterator[Entry]:

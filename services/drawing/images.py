@@ -1,0 +1,86 @@
+"""Cameras, images and fields."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from services.drawing.common import (
+    BLUE,
+    GRAY,
+    ORANGE,
+    VIEWS,
+    VIOLET,
+    Entry,
+    Level,
+    jpeg,
+    series,
+    unrectified,
+    values,
+)
+from services.drawing.growth import style as growth_style
+from suturetrack.camera import Camera, StereoRig
+from suturetrack.segmentation import direction_image
+from suturetrack.types import Float64, RidgeField, StereoFrame
+
+_PROCESS_COLORS = {"source": BLUE, "segmenter": VIOLET, "tracker": ORANGE}
+
+
+def cameras(rig: StereoRig) -> Iterator[Entry]:
+    """The cameras; all of it static."""
+    yield "/rig", rr.ViewCoordinates.RDF
+    poses = (np.zeros(3), np.array([rig.baseline, 0.0, 0.0]))
+    for view, camera, position in zip(VIEWS, (rig.left, rig.right), poses, strict=True):
+        yield f"/rig/{view}", rr.Transform3D(translation=position, mat3x3=camera.rectification)
+        pinhole = rr.Pinhole(
+            image_from_camera=camera.matrix,
+            resolution=rig.image_size,
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=3 * rig.baseline,
+        )
+        yield f"/rig/{view}/image", pinhole
+    yield from growth_style()
+    yield "/run/calibration", values("Calibration", _calibration(rig))
+
+
+def frame(frame: StereoFrame, level: Level) -> Iterator[Entry]:
+    """Both raw images: JPEG (light), or as they are (full)."""
+    for view, image in zip(VIEWS, (frame.left, frame.right), strict=True):
+        if level == "full":
+            yield (
+                f"/rig/{view}/image",
+                rr.Image(image, color_model="BGR"[: image[0, 0].size] or "L"),
+            )
+        else:
+            yield f"/rig/{view}/image", jpeg(image)
+
+
+def field(field: RidgeField, rig: StereoRig, level: Level) -> Iterator[Entry]:
+    """The direction fields in false colour over the raw image; as numbers too (full)."""
+    for view, vectors in zip(VIEWS, (field.left, field.right), strict=True):
+        picture = unrectified(direction_image(vectors), rig, view)
+        yield f"/rig/{view}/image/direction", jpeg(picture)
+        if level == "full":
+            yield f"/rig/{view}/field", rr.Tensor(vectors, dim_names=("v", "u", "component"))
+
+
+def process_style(process: str) -> Iterator[Entry]:
+    """Names, colours and widths of one process's plots; all of it static."""
+    for quantity in ("latency_ms", "rate_hz", "dropped", "memory_mb"):
+        color = _PROCESS_COLORS.get(process, GRAY)
+        yield f"/plots/{quantity}/{process}", series(**{process: color})
+
+
+def _calibration(rig: StereoRig) -> dict[str, Any]:
+    def numbers(view: str, camera: Camera) -> dict[str, Float64]:
+        return {f"{view}_{name}": value for name, value in vars(camera).items()}
+
+    return {
+        "image_size": rig.image_size,
+        "metres_per_unit": rig.metres_per_unit,
+        **numbers("left", rig.left),
+        **numbers("right", rig.right),
+    }
