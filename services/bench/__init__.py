@@ -1,0 +1,66 @@
+"""`suturetrack bench`: accuracy and speed, each figure beside its reference in the same run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from services.bench import initialization, report, segmentation, tracking
+from services.bench.initialization import InitializationBench
+from services.bench.report import Plot
+from services.bench.segmentation import SegmentationBench
+from services.bench.tracking import TrackingBench
+
+_PLOTS = {
+    "tracking": (
+        Plot("rms", "scenario", logarithmic=True),
+        Plot("length_error_percent", "scenario"),
+        Plot("ends_p95", "scenario", logarithmic=True),
+        Plot("false_percent", "scenario"),
+        Plot("tracked_percent", "scenario"),
+    ),
+    "initialization": (
+        Plot("mean", "data", reference="published_mean", logarithmic=True),
+        Plot("length_error_percent", "data", reference="published_length_error_percent"),
+        Plot("worst_end", "data", logarithmic=True),
+        Plot("seconds", "data"),
+    ),
+    "segmentation": (Plot("pair_ms", "filter", logarithmic=True), Plot("f1", "filter")),
+}
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """Measure accuracy and speed, each figure beside its reference in the same run."""
+
+    what: (
+        Annotated[TrackingBench, tyro.conf.subcommand("tracking")]
+        | Annotated[InitializationBench, tyro.conf.subcommand("initialization")]
+        | Annotated[SegmentationBench, tyro.conf.subcommand("segmentation")]
+    )
+    """The benchmark."""
+    json: Path | None = None
+    """Write every row at full precision to this file."""
+    page: Path | None = None
+    """Write one HTML page with tables and plots to this file."""
+
+
+def run(config: BenchConfig) -> None:
+    """Runs one benchmark, prints its rows, and writes what was asked for."""
+    console = Console()
+    table: list[object]
+    match config.what:
+        case TrackingBench():
+            name, table = "tracking", [*tracking.run(config.what, console)]
+        case InitializationBench():
+            name, table = "initialization", [*initialization.run(config.what, console)]
+        case SegmentationBench():
+            name, table = "segmentation", [*segmentation.run(config.what, console)]
+    if config.json is not None:
+        report.write_json(config.json, {name: table})
+    if config.page is not None:
+        report.write_page(config.page, f"suturetrack bench {name}", {name: table}, _PLOTS)

@@ -1,0 +1,206 @@
+"""`suturetrack bench initialization`: first curves against the truth, beside published figures."""
+
+from __future__ import annotations
+
+import csv
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from services.bench import report
+from suturetrack import metrics, nurbs
+from suturetrack.calibration import load_calibration
+from suturetrack.camera import StereoRig
+from suturetrack.initialization import InitializationError, initialize
+from suturetrack.segmentation import Segmenter
+from suturetrack.stage import SCENARIOS, open_scene
+from suturetrack.types import Float64, InputError, Nurbs, Seed, Stamp, StereoFrame
+
+_SAMPLES = 600
+
+
+@dataclass(frozen=True)
+class InitializationBench:
+    """From one seed pixel to the whole thread: accuracy and time, every case a row."""
+
+    scenarios: tuple[str, ...] = ()
+    """Scenes of the bench top; all of them by default, none with --pairs."""
+    seeds: int = 12
+    """Fresh seeds of each scenario."""
+    first_seed: int = 100
+    """The seeds count from here."""
+    rig: str = "bench"
+    """The rig of the scenes."""
+    pairs: Path | None = None
+    """A folder of pairs: <name>/{left.png,right.png,calibration.yaml,seed.json,truth.json} and, where
+    there are published figures, published.csv with the columns file, ours_len, gt_len, e_mean, e_max."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One first curve; distances in mm on the bench top, in the calibration's unit for pairs."""
+
+    data: str
+    seed: int
+    solved: bool
+    confidence: float
+    mean: float
+    published_mean: float
+    largest: float
+    published_largest: float
+    rms: float
+    length_error_percent: float
+    published_length_error_percent: float
+    worst_end: float
+    reprojection_px: float
+    seconds: float
+    reason: str
+
+
+def rows(config: InitializationBench) -> Iterator[Row]:
+    """Every case in turn: the folder's pairs, then the bench top's scenes."""
+    if config.pairs is not None:
+        yield from _pairs(config.pairs)
+    names = config.scenarios or (() if config.pairs is not None else tuple(SCENARIOS))
+    for name in names:
+        for k in range(config.seeds):
+            yield _scene(name, config.first_seed + k, config.rig)
+
+
+def run(config: InitializationBench, console: Console) -> list[Row]:
+    """Prints the rows and their summary."""
+    table = list(track(rows(config), "Initialisation", console=console, transient=True))
+    report.print_rows(console, "Initialisation", table)
+    solved = [r for r in table if r.solved]
+    if solved:
+        console.print(
+            f"{len(solved)} of {len(table)} solved; median mean error "
+            f"{np.median([r.mean for r in solved]):.3g}, worst {max(r.mean for r in solved):.3g}"
+        )
+    return table
+
+
+def _scene(name: str, seed: int, rig: str) -> Row:
+    scene = open_scene(name, seed, rig)
+    thread = scene.threads[0]
+    truth = next(t for t in scene.truth(0) if t.thread == thread)
+    frame = StereoFrame(Stamp(0, 0, 0), *scene.render(0))
+    start = Seed(thread, pixel=scene.seed_pixel(0, thread))
+    unit = 1000 * scene.rig.metres_per_unit
+    return _row(f"{name}, {rig}", seed, frame, scene.rig, start, truth.points, unit, {})
+
+
+def _pairs(folder: Path) -> Iterator[Row]:
+    cases = sorted(p.parent for p in folder.glob("*/calibration.yaml"))
+    if not cases:
+        raise InputError(f"pairs {folder}: no <name>/calibration.yaml inside")
+    published = {}
+    if (folder / "published.csv").exists():
+        with (folder / "published.csv").open(newline="") as file:
+            published = {line["file"]: line for line in csv.DictReader(file)}
+    for case in cases:
+        left, right = (_read(case / f"{view}.png") for view in ("left", "right"))
+        seed = json.loads((case / "seed.json").read_text())
+        truth = None
+        if (case / "truth.json").exists():
+            content = json.loads((case / "truth.json").read_text())
+            curve = nurbs.curve_from(
+                content["degree"], np.array(content["knots"]), np.array(content["control_points"])
+            )
+            truth = _dense(curve)
+        yield _row(
+            case.name,
+            0,
+            StereoFrame(Stamp(0, 0, 0), left, right),
+            load_calibration(case / "calibration.yaml"),
+            Seed(pixel=(seed["u"], seed["v"])),
+            truth,
+            1.0,
+            published.get(case.name, {}),
+        )
+
+
+def _row(
+    data: str,
+    number: int,
+    frame: StereoFrame,
+    rig: StereoRig,
+    seed: Seed,
+    truth: Float64 | None,
+    unit: float,
+    published: dict[str, str],
+) -> Row:
+    nan = float("nan")
+    segmenter = Segmenter(rig)
+    began = time.perf_counter()
+    try:
+        segmenter.learn(frame, seed)
+        first = initialize(segmenter.step(frame), rig, seed)
+    except InitializationError as error:
+        blank = dict.fromkeys(("mean", "largest", "rms", "length", "end", "pixels"), nan)
+        reason, confidence = str(error), 0.0
+    else:
+        blank = _errors(first.curve, truth, unit) | {"pixels": first.reprojection_px}
+        reason, confidence = "; ".join(first.reasons), first.confidence
+    return Row(
+        data=data,
+        seed=number,
+        solved=_is_solved(blank, truth, unit),
+        confidence=confidence,
+        mean=blank["mean"],
+        published_mean=float(published.get("e_mean", nan)),
+        largest=blank["largest"],
+        published_largest=float(published.get("e_max", nan)),
+        rms=blank["rms"],
+        length_error_percent=blank["length"],
+        published_length_error_percent=_published_length(published),
+        worst_end=blank["end"],
+        reprojection_px=blank["pixels"],
+        seconds=time.perf_counter() - began,
+        reason=reason,
+    )
+
+
+def _errors(curve: Nurbs, truth: Float64 | None, unit: float) -> dict[str, float]:
+    if truth is None:
+        return dict.fromkeys(("mean", "largest", "rms", "length", "end"), float("nan"))
+    error = metrics.curve_error(_dense(curve), truth)
+    return {
+        "mean": unit * error.mean,
+        "largest": unit * error.largest,
+        "rms": unit * error.rms,
+        "length": error.length_percent,
+        "end": unit * max(error.ends),
+    }
+
+
+def _is_solved(errors: dict[str, float], truth: Float64 | None, unit: float) -> bool:
+    """Mean error below 1 % of the true length and length error below 5 %."""
+    if truth is None:
+        return bool(np.isfinite(errors["pixels"]))
+    near = errors["mean"] < 0.01 * unit * metrics.polyline_length(truth)
+    return bool(near and abs(errors["length"]) < 5)
+
+
+def _published_length(published: dict[str, str]) -> float:
+    if not published.get("gt_len"):
+        return float("nan")
+    return 100 * (float(published["ours_len"]) / float(published["gt_len"]) - 1)
+
+
+def _dense(curve: Nurbs) -> Float64:
+    return nurbs.evaluate(curve, nurbs.evenly_spaced(curve, _SAMPLES))
+
+
+def _read(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise InputError(f"pairs: {path} is missing or no image")
+    return image
