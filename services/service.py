@@ -1,0 +1,199 @@
+"""What every process shares: parameters, signals, health, recording, closing, exit status."""
+
+from __future__ import annotations
+
+import _thread
+import logging
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Literal, Self
+
+import psutil
+
+from services import topics
+from services.bus import Bus
+from services.checks import check_name
+from services.messages import Health
+from services.meter import Meter
+from services.recording import Recorder
+from services.zenoh_transport import ZenohTransport, load_config, local_config
+from suturetrack.camera import StereoRig
+from suturetrack.types import InputError, Stamp
+
+HEARTBEAT_S = 1.0
+_GRACE_S = 1.2
+"""From the wish to stop until a step that takes too long is interrupted."""
+_COMPLAINT_INTERVAL_S = 1.0
+
+log = logging.getLogger("suturetrack")
+
+
+class Stopped(Exception):
+    """The process was asked to stop while it waited for something that it needs."""
+
+
+@dataclass(frozen=True)
+class ServiceConfig:
+    """What every process of a rig is told."""
+
+    rig: str = "rig"
+    """Name of the rig; keeps several apart."""
+    zenoh: Path | None = None
+    """A Zenoh configuration file; without it, processes of this user on this machine find one another
+    and nobody else does."""
+    run_dir: Path | None = None
+    """Folder to record into; nothing is recorded without it."""
+    recording: Literal["light", "full"] = "light"
+    """light: JPEG images, states and energies; full: lossless images and the fields as numbers too."""
+    lockstep: bool = False
+    """Every frame, in order, the next one only when the tracker is done with this one."""
+
+
+class Service:
+    """One running process, as its body sees it."""
+
+    def __init__(self, name: str, config: ServiceConfig, bus: Bus):
+        self.name = name
+        self.config = config
+        self.bus = bus
+        self.meter = Meter()
+        self.recorder: Recorder | None = None
+        self._unrecorded: deque[Health] = deque(maxlen=8)
+        self._complaints: deque[str] = deque(maxlen=8)
+        self._last_complaint = float("-inf")
+        self._heartbeat = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        bus.complain = self.complain
+
+    def calibrated_rig(self) -> StereoRig:
+        """The rig as the source tells it, as soon as there is a source; raises Stopped."""
+        rig = self.bus.ask_until_answered(topics.CALIBRATION, None)
+        if rig is None:
+            raise Stopped
+        return rig
+
+    def record(self, rig: StereoRig, config: object) -> Recorder:
+        """Opens the recording; it is closed with the service."""
+        run_dir, level = self.config.run_dir, self.config.recording
+        self.recorder = Recorder(run_dir, self.name, level, rig, config)
+        return self.recorder
+
+    def ready(self) -> None:
+        """Tells everyone that the process is ready, and starts the heartbeat."""
+        self.bus.declare_alive()
+        self._heartbeat.start()
+        log.info("ready")
+
+    def finished(self, stamp: Stamp) -> int:
+        """Counts a frame whose result has just been published; the time now, ns."""
+        now_ns = time.time_ns()
+        self.meter.count(stamp, now_ns)
+        if self.recorder is not None:
+            while self._complaints:
+                self.recorder.log(self._complaints.popleft(), "WARN")
+            while self._unrecorded:
+                self.recorder.health(self._unrecorded.popleft())
+        return now_ns
+
+    def complain(self, text: str) -> None:
+        """Logs a warning, at most one a second; those in between are counted in the health."""
+        now = time.monotonic()
+        if now - self._last_complaint >= _COMPLAINT_INTERVAL_S:
+            self._last_complaint = now
+            self._complaints.append(text)
+            log.warning("%s (%d refused so far)", text, self.bus.refused)
+
+    def health(self) -> Health:
+        """The heartbeat as of now; begins a new window of its figures."""
+        window, whole = self.meter.window(), self.meter.whole()
+        return Health(
+            process=self.name,
+            time_ns=time.time_ns(),
+            stamp=self.meter.last,
+            rate_hz=window.rate_hz,
+            latency=window.latency,
+            run_rate_hz=whole.rate_hz,
+            run_latency=whole.latency,
+            frames=whole.frames,
+            dropped=self.bus.dropped + self.meter.skipped,
+            refused=self.bus.refused,
+            memory_mb=psutil.Process().memory_info().rss / 1e6,
+            warning=(self.recorder and self.recorder.problem) or "",
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.bus.stop.set()
+        if self._heartbeat.is_alive():
+            self._heartbeat.join()
+            last = self.health()
+            self.bus.publish(topics.HEALTH, last)
+            self._unrecorded.append(last)
+        if self.recorder is not None:
+            while self._unrecorded:
+                self.recorder.health(self._unrecorded.popleft())
+            if error is not None and not isinstance(error, Stopped):
+                self.recorder.log(f"{kind.__name__ if kind else ''}: {error}", "ERROR")
+            self.recorder.close()
+        self.bus.close()
+
+    def _beat(self) -> None:
+        while not self.bus.stop.wait(HEARTBEAT_S):
+            health = self.health()
+            self.bus.publish(topics.HEALTH, health)
+            self._unrecorded.append(health)
+
+
+def run(name: str, config: ServiceConfig, body: Callable[[Service], None]) -> None:
+    """Runs a process until its body ends, or until SIGINT or SIGTERM.
+
+    Raises:
+        InputError: something that the user gave is at fault.
+    """
+    try:
+        check_name(config.rig, "rig")
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    zenoh = local_config(config.rig, name) if config.zenoh is None else load_config(config.zenoh)
+    bus = Bus(ZenohTransport(zenoh, patient=config.lockstep), config.rig, name)
+    try:
+        with Service(name, config, bus) as service, _stopped_by_signals(bus):
+            body(service)
+    except Stopped:
+        log.info("stopped")
+
+
+@contextmanager
+def _stopped_by_signals(bus: Bus) -> Iterator[None]:
+    """SIGINT and SIGTERM end the loops; a step that goes on for too long is interrupted."""
+    ended = threading.Event()
+
+    def stop() -> None:
+        bus.stop.set()
+        if not ended.wait(_GRACE_S):
+            _thread.interrupt_main()
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        # The interrupted loop may hold the lock that `stop` needs.
+        threading.Thread(target=stop, daemon=True).start()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        ended.set()
