@@ -82,6 +82,176 @@ MESSAGES: list[Any] = [
     Truth(STAMP, "0", RNG.normal(size=(9, 3)), 0.2, np.ones(9, bool)),
     STAMP,
     HEALTH,
+    rig(),
+    None,
+]
+
+
+def assert_same(a: Any, b: Any) -> None:
+    assert type(a) is type(b)
+    if dataclasses.is_dataclass(a):
+        for part in dataclasses.fields(a):
+            assert_same(getattr(a, part.name), getattr(b, part.name))
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+    elif isinstance(a, float):
+        assert a == b or (math.isnan(a) and math.isnan(b))
+    else:
+        assert a == b
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: type(m).__name__)
+def test_every_message_comes_back_to_the_bit(message: Any) -> None:
+    packet = wire.encode(message, "source-1", 41, 99)
+    back, header = wire.decode(packet, type(message))
+    assert_same(back, message)
+    assert (header.publisher, header.number, header.sent_ns) == ("source-1", 41, 99)
+
+
+def test_every_topic_has_a_form_on_the_wire() -> None:
+    kinds = {topic.kind for topic in topics.TOPICS}
+    kinds |= {kind for question in topics.QUESTIONS for kind in (question.kind, question.answer)}
+    assert kinds <= {type(message) for message in MESSAGES}
+
+
+@given(
+    hnp.arrays(np.float64, (8, 3), elements=st.floats(-1e6, 1e6)),
+    st.floats(1e-6, 1e6),
+    st.sampled_from(Status),
+)
+def test_states_keep_every_digit(points: np.ndarray, length: float, status: Status) -> None:
+    sent = state(curve=dataclasses.replace(curve(8), control_points=points), length=length)
+    sent = dataclasses.replace(sent, status=status)
+    assert_same(wire.decode(wire.encode(sent), ThreadState)[0], sent)
+
+
+def test_images_travel_as_raw_pixels_that_any_language_can_read() -> None:
+    sent = frame((48, 64, 3))
+    packet = wire.encode(sent)
+    assert packet.encoding == "application/octet-stream;frame/1"
+    assert packet.payload == sent.left.tobytes() + sent.right.tobytes()
+    header = msgspec.msgpack.decode(packet.attachment)
+    assert header["shapes"] == [[48, 64, 3], [48, 64, 3]]
+    assert header["stamp"] == [STAMP.frame, STAMP.capture_ns, STAMP.released_ns]
+
+
+def test_views_that_are_not_contiguous_are_sent_right() -> None:
+    wide = frame((48, 128, 3)).left
+    sent = StereoFrame(STAMP, wide[:, :64], wide[:, 64:])
+    assert_same(wire.decode(wire.encode(sent), StereoFrame)[0].right, wide[:, 64:].copy())
+
+
+def test_lengths_are_scaled_to_metres_and_back() -> None:
+    in_mm = state(curve=curve(), length=175.0, sigma=np.full(5, 0.25))
+    in_m = wire.scaled(in_mm, 0.001)
+    assert in_m.length == pytest.approx(0.175)
+    np.testing.assert_allclose(in_m.sigma, 0.25e-3)
+    assert in_m.curve is not None
+    assert in_mm.curve is not None
+    np.testing.assert_allclose(in_m.curve.control_points, in_mm.curve.control_points / 1000)
+    np.testing.assert_array_equal(in_m.curve.knots, in_mm.curve.knots)
+    assert wire.scaled(Seed("0", point=(1.0, 2.0, 3.0)), 0.5).point == (0.5, 1.0, 1.5)
+    assert wire.scaled(Seed("0", pixel=(1.0, 2.0)), 0.5).pixel == (1.0, 2.0)
+
+
+def refused(packet: Packet, kind: type[Any], reason: str) -> None:
+    with pytest.raises(WireError, match=reason):
+        wire.decode(packet, kind)
+
+
+def test_another_version_or_schema_is_refused_with_both_names() -> None:
+    packet = wire.encode(state())
+    newer = dataclasses.replace(packet, encoding="application/msgpack;state/2")
+    refused(newer, ThreadState, r"state/2.*expected.*state/1")
+    refused(packet, Truth, r"state/1.*expected.*truth/1")
+
+
+def header_of(packet: Packet, **changes: Any) -> Packet:
+    header = {**msgspec.msgpack.decode(packet.attachment), **changes}
+    return dataclasses.replace(packet, attachment=msgspec.msgpack.encode(header))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"shapes": [[48, 64, 3], [48, 63, 3]]}, "bytes for shapes"),
+        ({"shapes": [[48, 64, 3]]}, "two shapes"),
+        ({"shapes": [[96, 32, 3], [48, 64, 3]]}, "left is"),
+        ({"shapes": [[48, 192], [48, 64, 3]]}, "left is"),
+        ({"shapes": [[9216], [9216]]}, "shapes"),
+        ({"shapes": [[8192] * 4, [8192] * 4]}, "bytes for shapes"),
+        ({"shapes": [[8192] * 1000, [0]]}, "shapes"),
+        ({"shapes": [[2**62, 4], [4, 2**62]]}, "shapes"),
+        ({"shapes": [[-48, -64, 3], [48, 64, 3]]}, "shapes"),
+        ({"shapes": "48x64"}, "shapes"),
+        ({"dtype": "<f4"}, "dtype"),
+        ({"dtype": "O"}, "dtype"),
+        ({"stamp": None}, "stamp"),
+        ({"stamp": [-1, 0, 0]}, "stamp"),
+        ({"stamp": [0, 2**63, 0]}, "stamp"),
+        ({"stamp": [0.5, 0, 0]}, "stamp"),
+        ({"publisher": "x" * 1000}, "publisher"),
+    ],
+)
+def test_headers_that_lie_are_refused(changes: dict[str, Any], reason: str) -> None:
+    refused(header_of(wire.encode(frame()), **changes), StereoFrame, reason)
+
+
+@dataclass(frozen=True)
+class Huge:
+    """A payload that must be refused by its size, without being read."""
+
+    size: int
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __bytes__(self) -> bytes:
+        raise AssertionError("a refused payload was read")
+
+
+def test_a_payload_of_hostile_size_is_not_even_read() -> None:
+    for message in (frame(), state()):
+        packet = dataclasses.replace(wire.encode(message), payload=Huge(1 << 40))
+        refused(packet, type(message), "bytes")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1.5])
+def test_fields_hold_only_unit_components(bad: float) -> None:
+    broken = field()
+    broken.right[5, 6, 1] = bad
+    refused(wire.encode(broken), RidgeField, r"\[-1, 1\]")
+
+
+def with_points(value: float) -> Nurbs:
+    points = curve().control_points.copy()
+    points[2, 1] = value
+    return dataclasses.replace(curve(), control_points=points)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        state(curve=with_points(math.nan)),
+        state(curve=with_points(math.inf)),
+        state(curve=dataclasses.replace(curve(), degree=0)),
+        state(curve=dataclasses.replace(curve(), degree=4)),
+        state(curve=dataclasses.replace(curve(), knots=curve().knots[::-1].copy())),
+        state(curve=dataclasses.replace(curve(), knots=np.zeros(10))),
+        state(curve=dataclasses.replace(curve(), weights=np.zeros(6))),
+        state(curve=dataclasses.replace(curve(), control_points=np.zeros((6, 2)))),
+        state(curve=dataclasses.replace(curve(), control_points=np.zeros(0))),
+        state(length=math.nan),
+        state(length=-1.0),
+        state(curve=None, length=0.1),
+        state(sigma=np.full(5, math.nan)),
+        state(sigma=np.full(5, -1.0)),
+        state(seen=np.ones(4, bool)),
+        state(energies=Energies(image_left=math.inf)),
+        state(thread="a/b"),
+        state(thread="**"),
+        state(thread=""),
         state(stamp=Stamp(-1, 0, 0)),
         Seed("0"),
         Seed("0", pixel=(1, 2), point=(1, 2, 3)),
