@@ -1,14 +1,68 @@
+"""What several tests share: rigs in different units and a curve to look at."""
+
 from __future__ import annotations
 
 import shutil
 import tempfile
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
+
+from suturetrack import nurbs
+from suturetrack.camera import StereoRig
+from suturetrack.types import Nurbs
+
+settings.register_profile(
+    "default", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("default")
+
+
+def make_rig(baseline: float = 40.0, metres_per_unit: float = 1e-3) -> StereoRig:
+    """A rectified 640x480 rig with a focal length of 800 px."""
+    k = np.array([[800.0, 0, 319.5], [0, 800.0, 239.5], [0, 0, 1]])
+    none = np.zeros(5)
+    translation = np.array([-baseline, 0, 0])
+    return StereoRig.from_calibration(
+        (640, 480), (k, none), (k, none), np.eye(3), translation, metres_per_unit
+    )
 
 
 @pytest.fixture
-def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def rig() -> StereoRig:
+    return make_rig()
+
+
+@pytest.fixture
+def distorted_rig() -> StereoRig:
+    """Cameras with barrel distortion, turned towards each other by a few degrees."""
+    k1 = np.array([[790.0, 0, 331.0], [0, 792.0, 236.0], [0, 0, 1]])
+    k2 = np.array([[801.0, 0, 309.0], [0, 799.0, 247.0], [0, 0, 1]])
+    d1 = np.array([-0.21, 0.05, 0.001, -0.002, 0.0])
+    d2 = np.array([-0.18, 0.03, -0.001, 0.001, 0.0])
+    angle = np.radians(3.0)
+    rotation = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
+    return StereoRig.from_calibration(
+        (640, 480), (k1, d1), (k2, d2), rotation, np.array([-40.0, 0.6, 0.9]), 1e-3
+    )
+
+
+@pytest.fixture
+def curve() -> Nurbs:
+    """A cubic of nine control points that bends in all directions, 150 to 240 mm before the camera."""
+    rng = np.random.default_rng(7)
+    x = np.linspace(-50, 50, 9)
+    points = np.c_[x, 30 * np.sin(x / 15), 195 + rng.normal(0, 12, 9)]
+    knots = nurbs.clamped_knots(np.array([0.15, 0.3, 0.5, 0.6, 0.85]), 3)
+    return nurbs.curve_from(3, knots, points)
+
+
+@pytest.fixture
+def rig_name(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Name of a rig whose sockets lie in a directory of the test's own, with a short path."""
     directory = tempfile.mkdtemp(prefix="suturetrack-")
     monkeypatch.setenv("XDG_RUNTIME_DIR", directory)

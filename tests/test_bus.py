@@ -32,24 +32,24 @@ Connect = Callable[[str], Bus]
 
 
 @pytest.fixture(params=["memory", "zenoh"])
-def connect(request: pytest.FixtureRequest, rig: str) -> Iterator[Connect]:
+def connect(request: pytest.FixtureRequest, rig_name: str) -> Iterator[Connect]:
     """Opens buses of one rig; closes them at the end."""
     hub, buses = Hub(), list[Bus]()
 
     def transport(process: str) -> Transport:
         if request.param == "memory":
             return hub.connect()
-        return ZenohTransport(local_config(rig, process))
+        return ZenohTransport(local_config(rig_name, process))
 
     def open_bus(process: str) -> Bus:
-        buses.append(Bus(transport(process), rig, process))
+        buses.append(Bus(transport(process), rig_name, process))
         return buses[-1]
 
     yield open_bus
     for bus in buses:
         bus.close()
     if request.param == "zenoh":
-        remove_sockets(rig)
+        remove_sockets(rig_name)
 
 
 def stamp(frame: int) -> Stamp:
@@ -213,7 +213,7 @@ def test_gaps_in_the_numbers_are_lost_messages(connect: Connect) -> None:
     assert (reader.lost, reader.passed_over) == (2, 0)
 
 
-def test_another_rig_hears_nothing(rig: str) -> None:
+def test_another_rig_hears_nothing(rig_name: str) -> None:
     with_hub = Hub()
     here, there = (Bus(with_hub.connect(), name, "source") for name in ("here", "there"))
     reader = here.every(topics.STEP)
@@ -240,8 +240,8 @@ def start_other() -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", OTHER])
 
 
-def test_a_killed_process_is_seen_to_die_and_may_come_back(rig: str) -> None:
-    source = Bus(ZenohTransport(local_config(rig, "source")), rig, "source")
+def test_a_killed_process_is_seen_to_die_and_may_come_back(rig_name: str) -> None:
+    source = Bus(ZenohTransport(local_config(rig_name, "source")), rig_name, "source")
     reader = source.every(topics.STEP)
     try:
         for _ in range(2):
@@ -255,46 +255,48 @@ def test_a_killed_process_is_seen_to_die_and_may_come_back(rig: str) -> None:
                 pass
     finally:
         source.close()
-        remove_sockets(rig)
+        remove_sockets(rig_name)
 
 
-def test_a_second_process_of_one_name_is_told_so(rig: str) -> None:
-    first = ZenohTransport(local_config(rig, "source"))
+def test_a_second_process_of_one_name_is_told_so(rig_name: str) -> None:
+    first = ZenohTransport(local_config(rig_name, "source"))
     try:
         with pytest.raises(InputError, match=r"rig 'test'.*'source' is running already"):
-            ZenohTransport(local_config(rig, "source"))
+            ZenohTransport(local_config(rig_name, "source"))
     finally:
         first.close()
-        remove_sockets(rig)
+        remove_sockets(rig_name)
 
 
-def test_nothing_listens_beyond_this_machine(rig: str) -> None:
-    buses = [ZenohTransport(local_config(rig, name)) for name in ("source", "tracker", "viewer")]
+def test_nothing_listens_beyond_this_machine(rig_name: str) -> None:
+    buses = [
+        ZenohTransport(local_config(rig_name, name)) for name in ("source", "tracker", "viewer")
+    ]
     try:
         mine = psutil.Process().net_connections(kind="inet")
         assert not [c for c in mine if c.status == psutil.CONN_LISTEN or not c.raddr]
-        directory = socket_directory(rig)
+        directory = socket_directory(rig_name)
         assert directory.stat().st_mode & 0o077 == 0
         assert {p.name for p in directory.glob("*.sock")} == {"source.sock", "tracker.sock"}
     finally:
         for bus in buses:
             bus.close()
-        remove_sockets(rig)
+        remove_sockets(rig_name)
     assert not directory.exists()
 
 
-def test_a_directory_open_to_others_is_refused(rig: str) -> None:
-    directory = socket_directory(rig)
+def test_a_directory_open_to_others_is_refused(rig_name: str) -> None:
+    directory = socket_directory(rig_name)
     directory.chmod(0o755)
     try:
         with pytest.raises(InputError, match="chmod 700"):
-            local_config(rig, "source")
+            local_config(rig_name, "source")
     finally:
         directory.chmod(0o700)
-        remove_sockets(rig)
+        remove_sockets(rig_name)
 
 
-def test_a_long_rig_name_is_refused(rig: str) -> None:
+def test_a_long_rig_name_is_refused(rig_name: str) -> None:
     name = "r" * 64
     deep = Path(os.environ["XDG_RUNTIME_DIR"]) / ("d" * 60)
     deep.mkdir(exist_ok=True)
@@ -333,9 +335,9 @@ while not sys.stdin.closed and sys.stdin.readline():
 """
 
 
-def test_images_come_through_shared_memory_and_nothing_of_it_stays(rig: str) -> None:
+def test_images_come_through_shared_memory_and_nothing_of_it_stays(rig_name: str) -> None:
     sender = subprocess.Popen([sys.executable, "-c", SENDER], stdin=subprocess.PIPE)
-    receiver = ZenohTransport(local_config(rig, "tracker"))
+    receiver = ZenohTransport(local_config(rig_name, "tracker"))
     shared = list[bool]()
     receiver.subscribe("big", lambda _, packet: shared.append(_is_shared(packet)))
     assert sender.stdin
@@ -354,7 +356,7 @@ def test_images_come_through_shared_memory_and_nothing_of_it_stays(rig: str) -> 
     sender.communicate()
     receiver.close()
     subprocess.run([sys.executable, "-c", SWEEP], check=True)
-    remove_sockets(rig)
+    remove_sockets(rig_name)
     # This process keeps its own mappings until it ends.
     assert not [file for file in files - _mapped(os.getpid()) if file.exists()]
 

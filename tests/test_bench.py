@@ -1,0 +1,173 @@
+"""The benchmarks' scoring: known errors come out as known figures, and nothing is left out."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from services.bench import report
+from services.bench.initialization import InitializationBench
+from services.bench.initialization import rows as initialization_rows
+from services.bench.tracking import Case, FrameScore, TrackingBench, score, summarise
+from services.bench.tracking import rows as tracking_rows
+from suturetrack import metrics, nurbs
+from suturetrack.camera import StereoRig
+from suturetrack.types import Energies, InputError, Nurbs, Stamp, Status, ThreadState, Truth
+from tests.conftest import make_rig
+
+STAMP = Stamp(0, 0, 0)
+CASE = Case("figure8-175", "bench", 1, "paper")
+GOOD = FrameScore(
+    status=Status.TRACKING,
+    energy=-0.9,
+    true_length=175.0,
+    limit=0.1,
+    milliseconds=3.0,
+    whole=True,
+    rms=0.2,
+    p95=0.4,
+    largest=0.6,
+    lateral=0.1,
+    depth=0.17,
+    length=175.35,
+    ends=(0.5, 0.7),
+    coverage=1.0,
+)
+LOST = replace(GOOD, status=Status.LOST)
+WRONG = replace(GOOD, p95=2.1)
+
+
+def state_of(curve: Nurbs | None, status: Status = Status.TRACKING) -> ThreadState:
+    length = nurbs.length(curve) if curve is not None else math.nan
+    none = np.zeros(0)
+    return ThreadState(STAMP, "0", status, curve, length, Energies(-0.9), none, none > 0)
+
+
+def truth_of(curve: Nurbs) -> Truth:
+    points = nurbs.evaluate(curve, nurbs.evenly_spaced(curve, 800))
+    return Truth(STAMP, "0", points, nurbs.length(curve), np.ones(800, bool))
+
+
+def moved(curve: Nurbs, by: tuple[float, float, float]) -> Nurbs:
+    return replace(curve, control_points=curve.control_points + np.array(by))
+
+
+def test_a_curve_pushed_away_from_the_camera_is_wrong_in_depth(
+    rig: StereoRig, curve: Nurbs
+) -> None:
+    line = nurbs.curve_from(1, np.array([0.0, 0, 1, 1]), np.array([[-30.0, 0, 200], [30, 0, 200]]))
+    s = score(state_of(moved(line, (0, 0, 1))), truth_of(line), rig, 0.05, 2.0)
+    assert s.rms == pytest.approx(1.0, rel=1e-3)
+    assert s.depth == pytest.approx(1.0, rel=0.02)
+    assert s.lateral < 0.15
+    assert s.ends == pytest.approx((1, 1))
+    assert score(state_of(curve), truth_of(curve), rig, 0.05, 2.0).rms < 1e-3
+
+
+def test_distances_are_in_mm_whatever_the_calibrations_unit(curve: Nurbs) -> None:
+    metres = replace(curve, control_points=curve.control_points / 1000)
+    rig = make_rig(0.04, metres_per_unit=1.0)
+    s = score(state_of(moved(metres, (0, 0.001, 0))), truth_of(metres), rig, 5e-5, 2.0)
+    assert s.ends == pytest.approx((1, 1))
+    assert s.length == pytest.approx(nurbs.length(curve))
+    assert s.limit == pytest.approx(0.05)
+
+
+def test_a_missing_half_costs_coverage_and_length(rig: StereoRig, curve: Nurbs) -> None:
+    s = score(state_of(nurbs.part(curve, 0, 0.5)), truth_of(curve), rig, 0.05, 2.0)
+    assert 0.3 < s.coverage < 0.7
+    assert s.length < 0.7 * s.true_length
+    assert s.largest > 20
+
+
+def test_a_lost_thread_without_a_curve_covers_nothing(rig: StereoRig, curve: Nurbs) -> None:
+    s = score(state_of(None, Status.LOST), truth_of(curve), rig, 0.05, 2.0)
+    assert s.coverage == 0
+    assert math.isnan(s.rms)
+
+
+def test_every_frame_counts_and_wrong_ones_are_false_only_while_called_tracking() -> None:
+    scores = (
+        [GOOD] * 5 + [LOST] * 3 + [GOOD] * 4 + [WRONG] * 2 + [replace(WRONG, status=Status.LOST)]
+    )
+    row = summarise(CASE, "0", scores, fps=30.0)
+    assert row.frames == 15
+    assert row.tracked_percent == pytest.approx(100 * 11 / 15)
+    assert row.false_percent == pytest.approx(100 * 2 / 15)
+    assert row.losses == 2
+    assert math.isinf(row.longest_recovery_s)
+    assert row.length_error_percent == pytest.approx(0.2)
+    assert row.sigma == pytest.approx(0)
+    assert row.limit_ratio == pytest.approx(2)
+
+
+def test_a_thread_that_was_never_found_is_a_loss() -> None:
+    row = summarise(CASE, "0", [replace(LOST, rms=math.nan, p95=math.nan)] * 4, fps=30.0)
+    assert (row.tracked_percent, row.false_percent, row.losses) == (0, 0, 1)
+
+
+def test_the_time_to_recover_is_that_of_the_longest_loss() -> None:
+    row = summarise(CASE, "0", [GOOD] + [LOST] * 3 + [GOOD] + [LOST] * 6 + [GOOD], fps=30.0)
+    assert (row.losses, row.longest_recovery_s) == (2, pytest.approx(0.2))
+
+
+def test_the_physical_limit_grows_with_noise_and_distance(curve: Nurbs) -> None:
+    points = truth_of(curve).points
+    rig = make_rig()
+    fine, coarse = (metrics.physical_limit(rig, points, noise) for noise in (0.05, 0.1))
+    assert 1.3 * fine < coarse < 2.1 * fine
+    farther = metrics.physical_limit(rig, points * 1.5, 0.05)
+    assert farther > 1.2 * fine
+    scaled = metrics.physical_limit(make_rig(0.04), points / 1000, 0.05)
+    assert scaled == pytest.approx(fine / 1000, rel=1e-6)
+
+
+def test_the_physical_limit_is_reached_by_the_best_estimate(rig: StereoRig) -> None:
+    """Noise of 0.05 px along the normals of an upright thread, fitted over and over."""
+    y = np.linspace(-40, 40, 400)
+    points = np.c_[6 * np.sin(y / 8), y, np.full(400, 200.0)]
+    along_u = np.c_[0.05 * np.hypot(1, 0.75 * np.cos(y / 8)), np.zeros(400)]
+    knots = nurbs.clamped_knots(np.linspace(0, 1, 22)[1:-1], 3)
+    rng = np.random.default_rng(0)
+    left, right = rig.project(points)
+    errors = []
+    for _ in range(20):
+        noisy = [p + rng.normal(0, 1, (400, 1)) * along_u for p in (left, right)]
+        fitted = nurbs.fit(rig.triangulate(*noisy), np.linspace(0, 1, 400), knots, 3)
+        curve = nurbs.evaluate(fitted, np.linspace(0, 1, 400))
+        errors.append(metrics.polyline_distances(curve, points))
+    achieved = float(np.sqrt(np.mean(np.square(errors))))
+    assert 0.5 * achieved < metrics.physical_limit(rig, points, 0.05) < 1.1 * achieved
+
+
+def test_an_unknown_scenario_gets_the_list() -> None:
+    with pytest.raises(InputError, match="figure8-107"):
+        next(tracking_rows(TrackingBench(scenarios=("nowhere",), seeds=1)))
+
+
+def test_a_folder_without_pairs_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no <name>/calibration\.yaml"):
+        next(initialization_rows(InitializationBench(pairs=tmp_path)))
+
+
+def test_rows_are_printed_and_written_whole(tmp_path: Path) -> None:
+    rows = [summarise(CASE, str(i), [GOOD] * 3, 30.0) for i in range(30)]
+    console = Console(width=400, record=True)
+    report.print_rows(console, "Tracking", rows)
+    assert console.export_text().count("figure8-175") == 30
+    report.write_json(tmp_path / "rows.json", {"tracking": rows})
+    content = json.loads((tmp_path / "rows.json").read_text())
+    assert len(content["tracking"]) == 30
+    assert content["tracking"][7]["length"] == pytest.approx(175.35)
+    plots = {"tracking": (report.Plot("rms", "scenario"),)}
+    report.write_page(tmp_path / "rows.html", "Figures", {"tracking": rows}, plots)
+    page = (tmp_path / "rows.html").read_text()
+    assert page.count("<tr>") == 31
+    assert "data:image/png;base64," in page
+    assert "http" not in page
