@@ -8,61 +8,51 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from services.drawing.common import VIEWS, part
-from suturetrack.camera import StereoRig
 from suturetrack.types import Float64
 
-_AHEAD = np.array([0.5, 0.0, 10.0])
-"""What the view of space looks at while no thread is known, in baselines."""
+PROCESSES = ("source", "segmenter", "tracker")
 _EYE = np.array([-0.8, -0.5, -0.4])
-"""Where its eye is from there, in distances to the cameras."""
+"""Where the eye of the view of space is from its target, in distances of the thread."""
 
 
-def blueprint(
-    threads: Sequence[str], rig: StereoRig, target: Float64 | None = None
-) -> rrb.Blueprint:
+def blueprint(threads: Sequence[str], target: Float64) -> rrb.Blueprint:
     """The layout for the given threads ("0" when there is none yet).
 
-    `target` is the (3,) point that the view of space looks at, in the rectified left frame; without
-    it, what stands ten baselines before the cameras.
+    `target` is a (3,) point on the thread, or where one may be, in the rectified left frame.
     """
     names = [part(thread) for thread in threads] or ["0"]
-    if target is None:
-        target = rig.baseline * _AHEAD
     return rrb.Blueprint(
         rrb.Tabs(
-            rrb.Horizontal(_scene(target), _plots(names), column_shares=[7, 3], name="Tracking"),
-            rrb.Grid(
-                *(_view(view) for view in VIEWS),
-                *(_view(view, "direction", name=f"{view}, direction field") for view in VIEWS),
-                grid_columns=2,
-                name="Segmentation",
+            rrb.Horizontal(
+                _scene(names, target), _plots(names), column_shares=[7, 3], name="Tracking"
             ),
-            rrb.Horizontal(*(_view(view, "growth/**") for view in VIEWS), name="Initialisation"),
+            _segmentation(),
+            rrb.Horizontal(
+                *(_view(view, "", "/growth/**") for view in VIEWS), name="Initialisation"
+            ),
             _processes(),
-            rrb.TextDocumentView(origin="/run", name="Parameters", contents="/run/**"),
+            _parameters(),
         ),
         rrb.TimePanel(timeline="frame", state="collapsed"),
         collapse_panels=True,
     )
 
 
-def _scene(target: Float64) -> rrb.Container:
-    images = rrb.Horizontal(*(_view(view, "curve") for view in VIEWS))
+def _scene(names: Sequence[str], target: Float64) -> rrb.Container:
+    images = rrb.Horizontal(*(_view(view, "", "/curve") for view in VIEWS))
     # From the side, with the cameras at one edge and the thread at the other.
     middle, distance = 0.6 * target, np.linalg.norm(target)
     eye = rrb.EyeControls3D(
         position=middle + distance * _EYE, look_target=middle, eye_up=(0, -1, 0)
     )
-    hidden = ["- /rig/left/image/**", "- /rig/right/image/**", "- /rig/thread/*/tangent"]
-    space = rrb.Spatial3DView(
-        origin="/rig",
-        name="Space",
-        contents=["+ /rig/**", *hidden, "+ /rig/left/image", "+ /rig/right/image"],
-        eye_controls=eye,
-    )
-    return rrb.Vertical(
-        images, rrb.Horizontal(space, _log(), column_shares=[5, 4]), row_shares=[5, 4]
-    )
+    hidden = [f"- /rig/{view}/**" for view in VIEWS]
+    hidden += [f"- /rig/thread/{name}/tangent" for name in names]
+    shown = [f"+ /rig/{view}/image" for view in VIEWS]
+    contents = ["+ /rig/**", *hidden, *shown]
+    space = rrb.Spatial3DView(origin="/rig", name="Space", contents=contents, eye_controls=eye)
+    columns = rrb.TextLogColumns(timeline_columns=["frame"], text_log_columns=["LogLevel", "Body"])
+    log = rrb.TextLogView(origin="/log", name="Log", contents="/log/**", columns=columns)
+    return rrb.Vertical(images, rrb.Horizontal(space, log, column_shares=[5, 4]), row_shares=[5, 4])
 
 
 def _plots(names: Sequence[str]) -> rrb.Container:
@@ -78,6 +68,22 @@ def _plots(names: Sequence[str]) -> rrb.Container:
         _plot("Length [mm]", *of_threads("length")),
         _plot("Latency [ms]", "/plots/latency_ms/**"),
         row_shares=[2, 5, 5, 4],
+    )
+
+
+def _segmentation() -> rrb.Container:
+    return rrb.Grid(
+        *(_view(view, "") for view in VIEWS),
+        *(_view(view, "/direction", name=f"{view}, hue is direction") for view in VIEWS),
+        grid_columns=2,
+        name="Segmentation",
+    )
+
+
+def _parameters() -> rrb.Container:
+    return rrb.Horizontal(
+        *(rrb.TextDocumentView(origin=f"/run/{p}/parameters", name=p) for p in PROCESSES),
+        name="Parameters",
     )
 
 
@@ -99,10 +105,5 @@ def _plot(name: str, *contents: str) -> rrb.TimeSeriesView:
 
 def _view(view: str, *layers: str, name: str | None = None) -> rrb.Spatial2DView:
     image = f"/rig/{view}/image"
-    contents = [image, *(f"{image}/{layer}" for layer in layers)]
+    contents = [f"{image}{layer}" for layer in layers]
     return rrb.Spatial2DView(origin=image, name=name or view, contents=contents)
-
-
-def _log() -> rrb.TextLogView:
-    columns = rrb.TextLogColumns(timeline_columns=["frame"], text_log_columns=["LogLevel", "Body"])
-    return rrb.TextLogView(origin="/log", name="Log", contents="/log/**", columns=columns)

@@ -141,7 +141,7 @@ class Recorder:
     ) -> None:
         """Records how a thread was looked for in one field; the timeline `growth` counts the steps."""
         if self._stream is None:
-            return None
+            return
         for step, entries in enumerate(self._growth(thread, result), 1):
             self._stream.set_time("growth", sequence=step)
             self._write(stamp, entries)
@@ -176,7 +176,7 @@ class Recorder:
             [(f"/log/{self._process}", rr.TextLog(f"{self._process}: {text}", level=level))],
         )
 
-    def flush_if_due(self) -> None:
+    def _flush_if_due(self) -> None:
         """When it is time: sends to the disk what is waiting, begins a new part, looks for trouble."""
         if self._stream is None or time.monotonic() - self._flushed < self._flush_seconds:
             return
@@ -205,7 +205,7 @@ class Recorder:
             self._stream.set_time("capture", timestamp=np.datetime64(stamp.capture_ns, "ns"))
         for entity, *what in entries:
             self._stream.log(entity, *what)
-        self.flush_if_due()
+        self._flush_if_due()
 
     def _write_static(self, entries: Iterable[Entry]) -> None:
         assert self._stream is not None
@@ -244,7 +244,9 @@ class Recorder:
             self._stream.send_blueprint(self._blueprint())
 
     def _blueprint(self) -> rrb.Blueprint:
-        return blueprint.blueprint(self._threads, self._rig, self._target)
+        ahead = np.array([0.0, 0.0, 10 * self._rig.baseline])
+        target = ahead if self._target is None else self._target
+        return blueprint.blueprint(self._threads, target)
 
     def _open_part(self) -> None:
         """Directs the stream to the next free file; every part explains itself."""
