@@ -94,7 +94,7 @@ class Reader(Generic[T]):
         try:
             header = wire.decode_header(packet)
         except WireError as error:
-            self._refuse(key, error)
+            self.refuse(f"{key}: {error}")
             return
         sender = (key, header.publisher)
         if len(self._next) >= _MOST_PUBLISHERS and sender not in self._next:
@@ -114,15 +114,16 @@ class Reader(Generic[T]):
             try:
                 return self._bus.open(self._topic, *item)
             except WireError as error:
-                self._refuse(item[0], error)
+                self.refuse(f"{item[0]}: {error}")
+
+    def refuse(self, reason: str) -> None:
+        """Counts and reports a bad message."""
+        self.refused += 1
+        self._bus.complain(f"refused a message: {reason}")
 
     def __iter__(self) -> Iterator[T]:
         while (message := self.get()) is not None:
             yield message
-
-    def _refuse(self, key: str, error: WireError) -> None:
-        self.refused += 1
-        self._bus.complain(f"refused a message on {key}: {error}")
 
 
 class Request(Generic[Q, A]):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _thread
 import logging
+import os
 import signal
 import threading
 import time
@@ -54,6 +55,8 @@ class ServiceConfig:
     """light: JPEG images, states and energies; full: lossless images and the fields as numbers too."""
     lockstep: bool = False
     """Every frame, in order, the next one only when the tracker is done with this one."""
+    parent: int | None = None
+    """Process id of the launcher: end when it has gone."""
 
 
 class Service:
@@ -171,9 +174,23 @@ def run(name: str, config: ServiceConfig, body: Callable[[Service], None]) -> No
     bus = Bus(ZenohTransport(zenoh, patient=config.lockstep), config.rig, name)
     try:
         with Service(name, config, bus) as service, _stopped_by_signals(bus):
+            if config.parent is not None:
+                _stop_with(config.parent, bus)
             body(service)
     except Stopped:
         log.info("stopped")
+
+
+def _stop_with(parent: int, bus: Bus) -> None:
+    """Stops the process when its parent has gone without a word."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            if bus.stop.wait(HEARTBEAT_S / 2):
+                return
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 @contextmanager

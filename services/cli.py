@@ -1,0 +1,96 @@
+"""`suturetrack VERB ...`: every verb is a configuration and a function, loaded when it is called."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+# Each process keeps to one core: they run side by side, and results do not depend on the machine.
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+for _name in _ONE_THREAD:
+    os.environ.setdefault(_name, "1")
+
+
+@dataclass(frozen=True)
+class _Verb:
+    module: str
+    config: str
+    purpose: str
+    process: bool = False
+    """Whether it is a process of the dataflow."""
+
+
+VERBS = {
+    "demo": _Verb("services.launch", "DemoConfig", "track a synthetic thread for 20 s, recorded"),
+    "run": _Verb("services.launch", "RunConfig", "track threads in a video, a folder, a camera"),
+    "reconstruct": _Verb(
+        "services.reconstruct", "ReconstructConfig", "one stereo pair to one curve, as JSON"
+    ),
+    "inspect": _Verb("services.inspect", "InspectConfig", "tables of a run"),
+    "export": _Verb("services.export", "ExportConfig", "the states of a run as JSON lines"),
+    "view": _Verb("services.view", "ViewConfig", "open a run in the Rerun viewer"),
+    "bench": _Verb("services.bench", "BenchConfig", "accuracy and speed beside references"),
+    "source": _Verb("services.source", "SourceConfig", "the process that releases frames", True),
+    "segmenter": _Verb(
+        "services.segmenter", "SegmenterConfig", "the process that makes ridge fields", True
+    ),
+    "tracker": _Verb(
+        "services.tracker", "TrackerConfig", "the process that holds the threads", True
+    ),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs one verb; the exit status is 0, 1 for input that is at fault, 2 for a wrong call."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or given[0] in ("-h", "--help"):
+        print(_overview())
+        return
+    if given[0] not in VERBS:
+        known = ", ".join(VERBS)
+        print(f"suturetrack: no verb {given[0]!r}; there are {known}", file=sys.stderr)
+        sys.exit(2)
+    sys.exit(_run(given[0], VERBS[given[0]], given[1:]))
+
+
+def _run(name: str, verb: _Verb, arguments: list[str]) -> int:
+    import tyro  # late, so that the overview and wrong verbs are quick
+
+    from suturetrack.types import InputError
+
+    module = importlib.import_module(verb.module)
+    kind = getattr(module, verb.config)
+    config = tyro.cli(kind, prog=f"suturetrack {name}", args=arguments)
+    try:
+        if verb.process:
+            from services import service
+
+            logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO)
+            service.run(name, config.service, lambda running: module.run(running, config))
+        else:
+            module.run(config)
+    except InputError as error:
+        print(f"suturetrack {name}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def _overview() -> str:
+    lines = [
+        "usage: suturetrack VERB [OPTIONS]",
+        "",
+        "Finds a surgical suture thread in stereo video from one seed point and holds a 3-D NURBS",
+        "curve on it. `suturetrack VERB --help` tells the options of a verb.",
+        "",
+    ]
+    return "\n".join(lines + [f"  {name:<12} {verb.purpose}" for name, verb in VERBS.items()])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,227 @@
+"""Starts the processes of a run, shows how they do, stops them in order, and sums up."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from services.arguments import arguments_of, write_config
+from services.bus import Bus
+from services.checks import check_name
+from services.fleet import Fleet, Launch
+from services.monitor import Monitor
+from services.service import ServiceConfig
+from services.sources import InputConfig, open_input
+from services.zenoh_transport import (
+    ZenohTransport,
+    load_config,
+    local_config,
+    remove_sockets,
+    socket_directory,
+    sweep_shared_memory,
+)
+from suturetrack.calibration import save_calibration
+from suturetrack.camera import StereoRig
+from suturetrack.initialization import InitializationConfig, seed_pixel
+from suturetrack.segmentation import SegmentationConfig
+from suturetrack.tracking import TrackingConfig
+from suturetrack.types import InputError, Seed
+
+_GLANCE_S = 0.2
+_LINE_S = 5.0
+"""Between two lines where there is no terminal to keep one line up to date."""
+_LAST_WORDS_S = 0.3
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Tracks the seeded threads of a source: starts source, segmenter and tracker and records them."""
+
+    input: Annotated[InputConfig, tyro.conf.arg(name="")]
+    service: Annotated[ServiceConfig, tyro.conf.arg(name="")] = field(default_factory=ServiceConfig)
+    seed: tuple[tuple[float, float], ...] = ()
+    """U V of a pixel on the thread in the raw left image of the first frame; another pair for every
+    further thread. The bench top knows its own."""
+    view: bool = False
+    """Open the recording in the Rerun viewer when the run is over."""
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    initialization: InitializationConfig = field(default_factory=InitializationConfig)
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Tracks a thread on the synthetic bench top for 20 s, and records it."""
+
+    service: Annotated[ServiceConfig, tyro.conf.arg(name="")] = field(default_factory=ServiceConfig)
+    scenario: str = "figure8-175"
+    """What happens on the bench top."""
+    view: bool = False
+    """Open the recording in the Rerun viewer when the run is over."""
+
+
+def run(config: RunConfig | DemoConfig) -> None:
+    """Runs until the source has ended, a process fails, or SIGINT or SIGTERM.
+
+    Raises:
+        InputError: something given is at fault, or a process failed.
+    """
+    if isinstance(config, DemoConfig):
+        demo = InputConfig(f"stage:{config.scenario}", fps=30.0, frames=600)
+        config = RunConfig(demo, config.service, view=config.view)
+    console = Console(highlight=False)
+    with ExitStack() as stack:
+        rig_name = stack.enter_context(_reserved(config.service))
+        config, rig = _resolve(config, rig_name)
+        _make_run_folder(config, rig)
+        console.print(f"Recording to {config.service.run_dir}")
+        if not config.seed:
+            console.print("No --seed U V: nothing is tracked until a seed is sent.")
+        monitor = _watch(config, console, stack)
+    for table in monitor.tables():
+        console.print(table)
+    console.print(f"Open it with: suturetrack view {config.service.run_dir}")
+    if config.view:
+        view = [sys.executable, "-m", "services.cli", "view", str(config.service.run_dir)]
+        subprocess.run(view, check=False)
+
+
+def _resolve(config: RunConfig, rig_name: str) -> tuple[RunConfig, StereoRig]:
+    """Everything that is left open filled in, and all that is given checked; raises InputError."""
+    footage, rig = open_input(config.input)
+    footage.close()
+    if config.service.lockstep and footage.live:
+        raise InputError("--lockstep needs recorded input; a camera does not wait")
+    seeds = config.seed or footage.seeds
+    for pixel in seeds:
+        seed_pixel(Seed(pixel=pixel), rig)
+    run_dir = config.service.run_dir or _fresh_folder(config.input.source)
+    service = replace(config.service, rig=rig_name, run_dir=run_dir.absolute(), parent=os.getpid())
+    return replace(config, seed=seeds, service=service), rig
+
+
+def _fresh_folder(source: str) -> Path:
+    name = Path(source.split(",")[0].rpartition(":")[2]).stem or "run"
+    return Path("recordings") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
+
+
+def _make_run_folder(config: RunConfig, rig: StereoRig) -> None:
+    folder = config.service.run_dir
+    assert folder is not None
+    if folder.is_dir() and any(folder.glob("*.rrd")):
+        raise InputError(f"run folder {folder} holds a run already; give another --run-dir")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_config(config, folder / "config.toml")
+        if config.input.calibration is None:
+            save_calibration(folder / "calibration.yaml", rig)
+        else:
+            shutil.copyfile(config.input.calibration, folder / "calibration.yaml")
+    except OSError as error:
+        raise InputError(f"run folder {folder}: {error.strerror}") from error
+
+
+@contextmanager
+def _reserved(service: ServiceConfig) -> Iterator[str]:
+    """The name of the rig, for this run alone; the default name gives way to a run that has it."""
+    try:
+        check_name(service.rig, "rig")
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    if service.zenoh is not None:
+        yield service.rig
+        return
+    names = [service.rig]
+    if service.rig == ServiceConfig.rig:
+        names.append(f"{service.rig}-{os.getpid()}")
+    for name in names:
+        with (socket_directory(name) / "run.lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            try:
+                yield name
+            finally:
+                remove_sockets(name)
+            return
+    raise InputError(f"rig {service.rig!r} runs already; stop that run, or give another --rig")
+
+
+def _watch(config: RunConfig, console: Console, stack: ExitStack) -> Monitor:
+    """Starts the processes and stays until they have ended; raises InputError when one fails."""
+    service = config.service
+    stop = list[int]()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: stop.append(number))
+    if service.zenoh is None:
+        stack.callback(sweep_shared_memory)
+        zenoh = local_config(service.rig, "run")
+    else:
+        zenoh = load_config(service.zenoh)
+    bus = Bus(ZenohTransport(zenoh), service.rig, "run")
+    stack.callback(bus.close)
+    monitor = Monitor(bus)
+    fleet = Fleet(_launches(config), console.print)
+    try:
+        ended = None
+        with closing(_glances(monitor, console)) as glances:
+            for _ in glances:
+                ended = fleet.ended()
+                if stop or ended:
+                    break
+    finally:
+        fleet.stop()
+        time.sleep(_LAST_WORDS_S)
+        monitor.listen()
+    if ended is not None and ended.status != 0 and not stop:
+        raise InputError(ended.complaint())
+    return monitor
+
+
+def _glances(monitor: Monitor, console: Console) -> Generator[None]:
+    """Keeps the live line up to date, for as long as it is asked for another glance."""
+    if console.is_terminal:
+        with Live(console=console, refresh_per_second=4, transient=True) as live:
+            while True:
+                monitor.listen()
+                live.update(Text(monitor.line()))
+                yield
+                time.sleep(_GLANCE_S)
+    spoken = time.monotonic()
+    while True:
+        monitor.listen()
+        if time.monotonic() - spoken >= _LINE_S:
+            spoken = time.monotonic()
+            console.print(monitor.line(), soft_wrap=True)
+        yield
+        time.sleep(_GLANCE_S)
+
+
+def _launches(config: RunConfig) -> list[Launch]:
+    """The processes of a run, in the order in which they are stopped."""
+    shared = arguments_of(config.service)
+    seed = ["--seed", *(str(x) for pixel in config.seed for x in pixel)] if config.seed else []
+    segmentation = arguments_of(config.segmentation, "segmentation.")
+    tracking = arguments_of(config.tracking, "tracking.")
+    initialization = arguments_of(config.initialization, "initialization.")
+    return [
+        Launch("source", (*shared, *arguments_of(config.input))),
+        Launch("segmenter", (*shared, *seed, *segmentation)),
+        Launch("tracker", (*shared, *seed, *tracking, *initialization)),
+    ]

@@ -1,0 +1,136 @@
+"""What a run looks like from outside: one live line, and a table at the end."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from rich.table import Table
+
+from services import topics
+from services.bus import Bus
+from services.messages import Health
+from suturetrack.types import Status, ThreadState, Truth
+
+_STALE_S = 3.0
+
+
+@dataclass
+class _Thread:
+    """What was heard of one thread."""
+
+    last: ThreadState
+    statuses: dict[Status, int] = field(default_factory=lambda: dict.fromkeys(Status, 0))
+    lengths_mm: list[float] = field(default_factory=list)
+    true_mm: list[float] = field(default_factory=list)
+
+
+class Monitor:
+    """Listens to states, truths and heartbeats of a rig."""
+
+    def __init__(self, bus: Bus):
+        self._states = bus.every(topics.STATE)
+        self._truths = bus.every(topics.TRUTH)
+        self._healths = bus.every(topics.HEALTH)
+        self._health: dict[str, Health] = {}
+        self._threads: dict[str, _Thread] = {}
+        self._true_mm: dict[str, float] = {}
+
+    def listen(self) -> None:
+        """Takes in what has arrived."""
+        while (truth := self._truths.get(0)) is not None:
+            self._take_truth(truth)
+        while (state := self._states.get(0)) is not None:
+            self._take_state(state)
+        while (health := self._healths.get(0)) is not None:
+            self._health[health.process] = health
+
+    def line(self) -> str:
+        """The run at a glance."""
+        if not self._health:
+            return "waiting for source, segmenter and tracker"
+        parts = [
+            f"{name} {health.rate_hz:.1f} Hz" + (" (silent)" if _is_stale(health) else "")
+            for name, health in self._in_order()
+        ]
+        tracker = self._health.get("tracker")
+        if tracker is not None:
+            parts.append(f"latency {tracker.latency.p50_ms:.0f}/{tracker.latency.p99_ms:.0f} ms")
+        parts.append(f"dropped {sum(h.dropped for h in self._health.values())}")
+        for name, thread in self._threads.items():
+            length = thread.last.length * 1000
+            known = "" if np.isnan(length) else f" {length:.1f} mm"
+            parts.append(f"thread {name} {thread.last.status}{known}")
+        warnings = [f"{name}: {h.warning}" for name, h in self._in_order() if h.warning]
+        return " · ".join(parts + warnings)
+
+    def tables(self) -> list[Table]:
+        """How the run went: the threads, and the processes."""
+        tables = [self._thread_table()] if self._threads else []
+        return [*tables, self._process_table()] if self._health else tables
+
+    def _take_truth(self, truth: Truth) -> None:
+        self._true_mm[truth.thread] = truth.length * 1000
+
+    def _take_state(self, state: ThreadState) -> None:
+        thread = self._threads.setdefault(state.thread, _Thread(state))
+        thread.last = state
+        thread.statuses[state.status] += 1
+        if state.status is Status.TRACKING:
+            thread.lengths_mm.append(state.length * 1000)
+            if state.thread in self._true_mm:
+                thread.true_mm.append(self._true_mm[state.thread])
+
+    def _in_order(self) -> list[tuple[str, Health]]:
+        order = ("source", "segmenter", "tracker")
+        names = sorted(self._health, key=lambda n: (order.index(n) if n in order else 9, n))
+        return [(name, self._health[name]) for name in names]
+
+    def _frames(self) -> int:
+        source = self._health.get("source")
+        seen = max((sum(t.statuses.values()) for t in self._threads.values()), default=0)
+        return max(seen, 0 if source is None else source.frames + source.dropped)
+
+    def _thread_table(self) -> Table:
+        table = Table(title=f"Threads, of {self._frames()} frames", title_justify="left")
+        for column in ("thread", "tracked %", "occluded %", "lost %", "length mm", "sigma mm"):
+            table.add_column(column, justify="right")
+        with_truth = any(thread.true_mm for thread in self._threads.values())
+        for column in ("true mm", "error %") if with_truth else ():
+            table.add_column(column, justify="right")
+        for name, thread in self._threads.items():
+            shares = [100 * thread.statuses[s] / max(1, self._frames()) for s in Status]
+            mean, sigma = _mean_and_sigma(thread.lengths_mm)
+            cells = [name, *(f"{s:.1f}" for s in shares), f"{mean:.2f}", f"{sigma:.2f}"]
+            if with_truth:
+                true, _ = _mean_and_sigma(thread.true_mm)
+                cells += [f"{true:.2f}", f"{100 * (mean - true) / true:+.2f}"]
+            table.add_row(*cells)
+        return table
+
+    def _process_table(self) -> Table:
+        table = Table(title="Processes; latency from the release of a frame", title_justify="left")
+        columns = ("process", "frames", "rate Hz", "p50 ms", "p99 ms", "max ms", "dropped")
+        for column in (*columns, "refused", "memory MB"):
+            table.add_column(column, justify="right")
+        for name, health in self._in_order():
+            latency = health.run_latency
+            table.add_row(
+                name,
+                str(health.frames),
+                f"{health.run_rate_hz:.2f}",
+                *(f"{ms:.1f}" for ms in (latency.p50_ms, latency.p99_ms, latency.max_ms)),
+                str(health.dropped),
+                str(health.refused),
+                f"{health.memory_mb:.0f}",
+            )
+        return table
+
+
+def _is_stale(health: Health) -> bool:
+    return time.time_ns() - health.time_ns > _STALE_S * 1e9
+
+
+def _mean_and_sigma(values: list[float]) -> tuple[float, float]:
+    return (float(np.mean(values)), float(np.std(values))) if values else (np.nan, np.nan)

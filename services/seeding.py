@@ -1,0 +1,96 @@
+"""Seeds that come in as questions, and what becomes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from services import topics
+from services.bus import Bus, Request
+from services.messages import SeedReply
+from services.wire import scaled
+from suturetrack import nurbs
+from suturetrack.camera import StereoRig
+from suturetrack.initialization import Initialization, InitializationError, seed_pixel
+from suturetrack.tracking import Tracker
+from suturetrack.types import InputError, Seed, Stamp
+
+
+@dataclass
+class _Case:
+    seed: Seed
+    attempts: int
+    request: Request[Seed, SeedReply] | None
+
+
+class SeedDesk:
+    """Hands seeds to the tracker, and tells whoever asked what was found.
+
+    Args:
+        patience: fields in which the tracker looks for a thread.
+    """
+
+    def __init__(self, bus: Bus, tracker: Tracker, rig: StereoRig, patience: int):
+        self._bus, self._tracker, self._rig, self._patience = bus, tracker, rig, patience
+        self._requests = bus.requests(topics.SEED)
+        self._cases: dict[str, _Case] = {}
+
+    def seed(self, seed: Seed, request: Request[Seed, SeedReply] | None = None) -> None:
+        """Has a thread looked for from the next field on; raises InputError outside the image."""
+        seed_pixel(seed, self._rig)
+        before = self._cases.pop(seed.thread, None)
+        if before is not None:
+            _answer(before, SeedReply(seed.thread, False, "another seed took its place"))
+        self._cases[seed.thread] = _Case(seed, self._patience, request)
+        self._tracker.seed(seed)
+
+    def take_requests(self) -> None:
+        """Takes the seeds that have come in."""
+        while (request := self._requests.get(0)) is not None:
+            seed = scaled(request.question, 1 / self._rig.metres_per_unit)
+            try:
+                self.seed(seed, request)
+            except InputError as error:
+                request.answer(SeedReply(seed.thread, False, str(error)))
+            else:
+                self._bus.publish(topics.SEEDING, request.question)
+
+    def settle(
+        self, stamp: Stamp, results: Mapping[str, Initialization | InitializationError]
+    ) -> None:
+        """Answers the seeds whose thread was found, or has been looked for long enough.
+
+        Raises:
+            InputError: a seed that nobody asked for, but that was given at the start, is on no thread.
+        """
+        for thread, result in results.items():
+            case = self._cases.get(thread)
+            if case is None:
+                continue
+            case.attempts -= 1
+            if isinstance(result, Initialization):
+                _answer(case, self._found(thread, stamp, result))
+            elif case.attempts > 0:
+                continue
+            elif case.request is None:
+                raise InputError(f"seed {case.seed.pixel}: {result.reason}")
+            else:
+                _answer(case, self._not_found(thread, stamp, result))
+            del self._cases[thread]
+
+    def _found(self, thread: str, stamp: Stamp, found: Initialization) -> SeedReply:
+        metres = self._rig.metres_per_unit
+        length_mm = nurbs.length(found.curve) * metres * 1000
+        outcome = f"found {length_mm:.1f} mm with confidence {found.confidence:.2f}"
+        reason = "; ".join((outcome, *found.reasons))
+        return SeedReply(thread, True, reason, stamp, scaled(found.curve, metres))
+
+    def _not_found(self, thread: str, stamp: Stamp, error: InitializationError) -> SeedReply:
+        raw = self._rig.raw_pixels(error.candidates)
+        candidates = tuple((float(u), float(v)) for u, v in raw)
+        return SeedReply(thread, False, error.reason, stamp, candidates=candidates)
+
+
+def _answer(case: _Case, reply: SeedReply) -> None:
+    if case.request is not None:
+        case.request.answer(reply)

@@ -1,0 +1,122 @@
+"""The process that releases stereo frames: paced by their own rate, or lock-step."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
+
+from services import topics
+from services.bus import Reader
+from services.service import Service, ServiceConfig
+from services.sources import Footage, InputConfig, open_input
+from services.sources.footage import Exposure
+from services.wire import scaled
+from suturetrack.types import InputError, Stamp, StereoFrame
+
+_LONGEST_STEP_S = 60.0
+"""Lock-step: how long the others may take for one frame."""
+_LAST_STEP_S = 2.0
+"""In real time: how long the last frame may take to go through."""
+
+
+@dataclass(frozen=True)
+class SourceConfig:
+    """Releases stereo frames from a recording, a camera or the synthetic bench top."""
+
+    input: Annotated[InputConfig, tyro.conf.arg(name="")]
+    service: Annotated[ServiceConfig, tyro.conf.arg(name="")] = field(default_factory=ServiceConfig)
+
+
+def run(service: Service, config: SourceConfig) -> None:
+    """Releases all frames, and ends when the last one went through.
+
+    Raises:
+        InputError: the source or the calibration is at fault, or a frame took forever in lock-step.
+    """
+    footage, rig = open_input(config.input)
+    if config.service.lockstep and footage.live:
+        raise InputError("--lockstep needs recorded input; a camera does not wait")
+    bus = service.bus
+    steps = bus.every(topics.STEP)
+    bus.answer(topics.CALIBRATION, lambda _: rig)
+    recorder = service.record(rig, config)
+    service.ready()
+    if not footage.live and not bus.wait_for_alive("segmenter"):
+        return
+    pace = _Pace(service, footage, config.input.frames)
+    for index, exposure in pace:
+        stamp = Stamp(index, exposure.capture_ns, _released_ns(footage, exposure))
+        frame = StereoFrame(stamp, exposure.left, exposure.right)
+        truths = [dataclasses.replace(truth, stamp=stamp) for truth in exposure.truths]
+        for truth in truths:
+            bus.publish(topics.TRUTH, scaled(truth, rig.metres_per_unit))
+        bus.publish(topics.FRAME, frame)
+        published_ns = service.finished(stamp)
+        recorder.frame(frame, published_ns)
+        for truth in truths:
+            recorder.truth(truth)
+        if config.service.lockstep and not _wait_for(steps, index, _LONGEST_STEP_S):
+            if bus.stop.is_set:
+                break
+            raise InputError(
+                f"lock-step: the tracker was not done with frame {index} after "
+                f"{_LONGEST_STEP_S:g} s; does every process run with --lockstep?"
+            )
+    if pace.last is not None:
+        _wait_for(steps, pace.last, _LAST_STEP_S)
+    footage.close()
+
+
+class _Pace:
+    """Gives every frame when it is due; skips those whose time has passed, but in lock-step none."""
+
+    def __init__(self, service: Service, footage: Footage, frames: int | None):
+        self._service, self._footage = service, footage
+        self._frames = frames
+        self._patient = service.config.lockstep or footage.live
+        self.last: int | None = None
+        """Number of the last frame given."""
+
+    def __iter__(self) -> _Pace:
+        self._index, self._began = 0, time.monotonic()
+        return self
+
+    def __next__(self) -> tuple[int, Exposure]:
+        if not self._patient:
+            self._skip()
+        index = self._index
+        if self._service.bus.stop.is_set or (self._frames is not None and index >= self._frames):
+            raise StopIteration
+        exposure = self._footage.read(index)
+        due_in = self._began + index / self._footage.fps - time.monotonic()
+        stopped = not self._patient and due_in > 0 and self._service.bus.stop.wait(due_in)
+        if exposure is None or stopped:
+            raise StopIteration
+        self.last, self._index = index, index + 1
+        return index, exposure
+
+    def _skip(self) -> None:
+        due = int((time.monotonic() - self._began) * self._footage.fps)
+        if due > self._index:
+            self._service.meter.skipped += due - self._index
+            self._index = due
+
+
+def _released_ns(footage: Footage, exposure: Exposure) -> int:
+    return exposure.capture_ns if footage.live else time.time_ns()
+
+
+def _wait_for(steps: Reader[Stamp], frame: int, seconds: float) -> bool:
+    """Whether the tracker is done with a frame in time."""
+    deadline = time.monotonic() + seconds
+    while (left := deadline - time.monotonic()) > 0:
+        step = steps.get(left)
+        if step is None:
+            return False
+        if step.frame >= frame:
+            return True
+    return False

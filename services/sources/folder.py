@@ -1,0 +1,55 @@
+"""A folder of image pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from services.sources.footage import Exposure, read_image
+from suturetrack.types import InputError
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+
+
+class FolderFootage:
+    """`left/*.png` and `right/*.png`, paired in the order of their names."""
+
+    live = False
+    seeds: tuple[tuple[float, float], ...] = ()
+
+    def __init__(self, folder: Path, fps: float):
+        self.fps = fps
+        self._pairs = _pairs(folder)
+        self.frame_count: int | None = len(self._pairs)
+        left = read_image(self._pairs[0][0])
+        self.size = left.shape[1], left.shape[0]
+
+    def read(self, index: int) -> Exposure | None:
+        """See `Footage`."""
+        if index >= len(self._pairs):
+            return None
+        paths = self._pairs[index]
+        left, right = (read_image(path) for path in paths)
+        if left.shape != right.shape:
+            raise InputError(f"{paths[0]} is {left.shape}, {paths[1]} is {right.shape}")
+        if (left.shape[1], left.shape[0]) != self.size:
+            raise InputError(f"{paths[0]} is {left.shape}, the first image was {self.size}")
+        return Exposure(round(index * 1e9 / self.fps), left, right)
+
+    def close(self) -> None:
+        """See `Footage`."""
+
+
+def _pairs(folder: Path) -> list[tuple[Path, Path]]:
+    views = []
+    for side in ("left", "right"):
+        if not (folder / side).is_dir():
+            raise InputError(
+                f"source {folder}: no folder {side}/; it needs left/*.png, right/*.png"
+            )
+        views.append(sorted(p for p in (folder / side).iterdir() if p.suffix.lower() in _SUFFIXES))
+    left, right = views
+    if not left or not right:
+        raise InputError(f"source {folder}: no images in left/ or right/")
+    if len(left) != len(right):
+        raise InputError(f"source {folder}: {len(left)} images in left/, {len(right)} in right/")
+    return list(zip(left, right, strict=True))

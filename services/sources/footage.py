@@ -1,0 +1,69 @@
+"""What all sources have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from suturetrack.types import Image, InputError, Truth
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Both images of one moment, before they are released."""
+
+    capture_ns: int
+    """The recording's own time; the wall clock for live input."""
+    left: Image
+    """(H, W, 3) BGR or (H, W) gray, uint8."""
+    right: Image
+    """As `left`."""
+    truths: tuple[Truth, ...] = ()
+    """Where the threads really are, when that is known."""
+
+
+class Footage(Protocol):
+    """A source of stereo frames."""
+
+    size: tuple[int, int]
+    """(width, height) of one view, px."""
+    fps: float
+    """Frames a second."""
+    frame_count: int | None
+    """How many frames there are; None when nobody knows."""
+    live: bool
+    """Whether frames come at their own pace and cannot be had again."""
+    seeds: tuple[tuple[float, float], ...]
+    """Pixels (u, v) of the first raw left image that are known to lie on threads."""
+
+    def read(self, index: int) -> Exposure | None:
+        """The frame with this number, asked for in rising order; None after the last one.
+
+        Raises:
+            InputError: the frame cannot be read.
+        """
+
+    def close(self) -> None:
+        """Lets files and devices go."""
+
+
+def read_image(path: Path) -> Image:
+    """An 8-bit image as (H, W, 3) BGR or (H, W) gray; raises InputError."""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None or image.size == 0:
+        raise InputError(f"image {path} cannot be read")
+    if image.dtype != np.uint8:
+        raise InputError(f"image {path} is {image.dtype}; convert it to 8 bit")
+    return np.ascontiguousarray(image[..., :3]) if image.ndim == 3 else image
+
+
+def halves(image: Image, name: str) -> tuple[Image, Image]:
+    """The left and the right view of a side-by-side image; raises InputError."""
+    width = image.shape[1]
+    if width % 2:
+        raise InputError(f"{name}: {width} columns cannot be two views side by side")
+    return image[:, : width // 2], image[:, width // 2 :]
