@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.initialization.fitting import Held, fit_marks, image_parameters, refine
+from suturetrack.initialization.ends import move_end, read_end
+from suturetrack.initialization.fitting import fit_marks, image_parameters, refine
 from suturetrack.initialization.growth import grow_thread, nearest_segment
 from suturetrack.initialization.matching import match
 from suturetrack.initialization.model import (
@@ -57,16 +58,14 @@ def initialize(
         if len(chain.pixels) < 4 * step:
             reason = f"the ridge at the seed is only {len(chain.pixels)} px long"
         raise InitializationError(reason, candidates, growth)
-    s = image_parameters(chain.pixels, matched.right)
-    points = rig.triangulate(chain.pixels, matched.right)
+    pixels = _trim(np.c_[chain.pixels, matched.right], field)
+    s = image_parameters(pixels[:, :2], pixels[:, 2:])
+    points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
     curve = fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
-    views = field.left, field.right
-    curve = refine(curve, views, rig, 2.0)
-    crests = Held.at(curve, views, rig).crests
-    residual = float(
-        np.mean([np.average(abs(c.offsets), weights=c.weights + 1e-9) for c in crests])
-    )
-    seen = float(np.mean([(c.weights > config.low).mean() for c in crests]))
+    curve, samples = refine(curve, (field.left, field.right), rig)
+    crests = samples.crests
+    residual = float(np.mean([np.average(abs(c.offsets), weights=c.trust + 1e-9) for c in crests]))
+    seen = float(np.mean([(c.response > config.low).mean() for c in crests]))
     return Initialization(curve, seen, (), residual, growth)
 
 
@@ -89,6 +88,16 @@ def seed_pixel(seed: Seed, rig: StereoRig) -> Float64:
             f"seed ({pixel[0]:.0f}, {pixel[1]:.0f}) is outside the {width}x{height} left image"
         )
     return pixel
+
+
+def _trim(pixels: Float64, field: RidgeField) -> Float64:
+    """Moves both ends of the (k, 4) chain, left and right pixels, to where the left thread ends."""
+    for _ in (0, 1):
+        reading = read_end(field.left, pixels[:, :2])
+        if np.isfinite(reading.offset_px):
+            pixels = move_end(pixels, reading.offset_px)
+        pixels = pixels[::-1]
+    return pixels
 
 
 def _right_growth(ridges: Ridges, pixels: Float64, config: InitializationConfig) -> ViewGrowth:

@@ -1,39 +1,34 @@
-"""From matched pixels to the NURBS curve: least squares, knots where the shape needs them."""
+"""From matched pixels to the curve: least squares, refined on the field, with few knots."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline
+from scipy.ndimage import gaussian_filter1d
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import search
+from suturetrack.initialization.crest import Crest, find_crest
+from suturetrack.initialization.ends import EndReading, read_end
+from suturetrack.kernels import spline
 from suturetrack.types import Float32, Float64, Nurbs
 
-DEGREE = 3
-_OFFSETS = np.arange(-4.0, 4.01, 0.5)
-"""Where the crest is looked for across the curve, px."""
-_NEAR_PX = 2.0
-"""How far the crest is expected from the curve, px (standard deviation)."""
-_CENTROID_REACH = 4
-"""Offsets on each side of the peak whose centroid is the crest."""
-_SPACING_PX = 2.0
+DEGREE = spline.DEGREE
+SPACING_PX = 2.0
 """Distance of the samples that hold the curve, px."""
-_ROUNDS = 3
-
-
-@dataclass(frozen=True, eq=False)
-class Crest:
-    """Where one view shows the crest beside the samples of a curve."""
-
-    normals: Float64
-    """(k, 2) unit normals of the projected curve."""
-    offsets: Float64
-    """(k,) signed distance from the curve to the crest along the normal, px."""
-    weights: Float64
-    """(k,) response there, in [0, 1]."""
+_LEAST_NOISE_PX = 0.03
+_ROUNDS = 4
+_EVIDENCE_STEPS = 3
+_STAY = 0.01
+"""Weight, against that of a crest, which keeps samples from sliding along the thread."""
+_STIFFEST = 1e9
+_END_NOISE_PX = 0.2
+_LARGEST_END_STEP_PX = 2.0
+_BEND_SAMPLES = 8.0
+"""Samples over which the visible bending is averaged."""
+_LEAST_FREEDOM = 0.3
+"""What a straight stretch may bend in disparity, against one that bends as the thread on average."""
 
 
 def image_parameters(left: Float64, right: Float64) -> Float64:
@@ -49,99 +44,176 @@ def fit_marks(points: Float64, s: Float64, spans: int) -> Nurbs:
     return nurbs.fit(points, s, knots, DEGREE, smoothing=1e-9)
 
 
-def find_crest(field: Float32, pixels: Float64) -> Crest:
-    """Looks for the crest across (k, 2) evenly spaced pixels of a projected curve."""
-    tangents = np.gradient(pixels, axis=0)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-    profiles = search.normal_profiles(field, pixels, tangents, _OFFSETS)
-    expected = profiles * np.exp(-0.5 * (_OFFSETS / _NEAR_PX) ** 2)
-    peak = np.argmax(expected, axis=1)
-    around = np.arange(-_CENTROID_REACH, _CENTROID_REACH + 1)
-    index = np.clip(peak[:, None] + around, 0, len(_OFFSETS) - 1)
-    window = np.take_along_axis(profiles, index, 1)
-    window = np.maximum(window - window.min(1, keepdims=True), 0) ** 2
-    total = window.sum(1)
-    offsets = (window * _OFFSETS[index]).sum(1) / np.maximum(total, 1e-12)
-    inside = (peak > 0) & (peak < len(_OFFSETS) - 1) & (total > 0)
-    heights = np.take_along_axis(profiles, peak[:, None], 1)[:, 0]
-    normals = np.c_[-tangents[:, 1], tangents[:, 0]]
-    return Crest(normals, offsets, np.where(inside, heights, 0.0))
-
-
-def refine(
-    curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig, stiffness_px: float
-) -> Nurbs:
-    """Gauss-Newton on the crests of both views.
-
-    Args:
-        curve: within a few pixels of the crests.
-        fields: (H, W, 2) left and right.
-        rig: the cameras.
-        stiffness_px: wavelength in pixels below which bends are smoothed away. Bending is measured
-            in pixels of u, v and disparity, because that is how the images inform depth.
-    """
-    for _ in range(_ROUNDS):
-        held = Held.at(curve, fields, rig)
-        curve = held.solve(curve.knots, stiffness_px)
-    return curve
-
-
 @dataclass(frozen=True, eq=False)
-class Held:
-    """A curve's samples and what the images say about them: the linear problem of one step."""
+class Samples:
+    """Places on a curve, evenly spaced in the images, and what the images say there."""
 
     s: Float64
+    """(k,) parameters."""
     points: Float64
-    crests: tuple[Crest, Crest]
+    """(k, 3)."""
+    length_px: float
+    """Mean length of the projected curve."""
     jacobians: tuple[Float64, Float64]
+    """(k, 2, 3) derivatives of the left and the right pixel."""
+    crests: tuple[Crest, Crest]
+    """The ridges of both views beside the curve."""
+    outward: Float64
+    """(2, 2, 2) view, end: unit vectors along the projected curve out of its ends."""
+    ends: tuple[tuple[EndReading, EndReading], tuple[EndReading, EndReading]]
+    """View, end: where the thread ends."""
 
     @classmethod
-    def at(cls, curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig) -> Held:
-        """Looks for the crests beside `curve`."""
-        s, points = _samples(curve, rig)
-        left, right = rig.project(points)
-        crests = find_crest(fields[0], left), find_crest(fields[1], right)
-        return cls(s, points, crests, rig.projection_jacobian(points))
-
-    def rows(self, view: int) -> Float64:
-        """(k, 3) how the offset in a view changes with the point in space."""
-        return np.einsum("ki,kij->kj", self.crests[view].normals, self.jacobians[view])
-
-    def solve(self, knots: Float64, stiffness_px: float) -> Nurbs:
-        """The curve over `knots` that fits the crests best."""
-        a = nurbs.basis(self.s, knots, DEGREE)
-        count = a.shape[1]
-        normal, right_side = np.zeros((3 * count, 3 * count)), np.zeros(3 * count)
-        for view, crest in enumerate(self.crests):
-            rows = self.rows(view)
-            design = (a[:, :, None] * rows[:, None]).reshape(len(a), -1)
-            weights = crest.weights / (1 + crest.offsets**2)
-            target = (rows * self.points).sum(1) + crest.offsets
-            normal += design.T @ (weights[:, None] * design)
-            right_side += design.T @ (weights * target)
-        left, right = self.jacobians
-        image = np.concatenate([left, (left - right)[:, :1]], axis=1)
-        second = np.asarray(BSpline(knots, np.eye(count), DEGREE)(self.s, 2))
-        scale = (stiffness_px / (_SPACING_PX * len(a))) ** 2
-        bends = np.einsum("km,kij->kimj", scale * second, image).reshape(-1, 3 * count)
-        normal += bends.T @ bends
-        stay = np.einsum("km,kij->kimj", _STAY * a, image).reshape(-1, 3 * count)
-        normal += stay.T @ stay
-        here = _STAY * np.einsum("kij,kj->ki", image, self.points).ravel()
-        right_side += stay.T @ here
-        return nurbs.curve_from(
-            DEGREE, knots, np.linalg.solve(normal, right_side).reshape(count, 3)
+    def of(cls, curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig) -> Samples:
+        """Samples `curve` and looks for the crests beside it."""
+        fine = np.linspace(0, 1, 16 * len(curve.control_points))
+        steps = [
+            np.linalg.norm(np.diff(p, axis=0), axis=1)
+            for p in rig.project(nurbs.evaluate(curve, fine))
+        ]
+        travelled = np.r_[0, np.cumsum((steps[0] + steps[1]) / 2)]
+        count = max(int(travelled[-1] / SPACING_PX), 2 * len(curve.control_points))
+        s = np.interp(np.linspace(0, travelled[-1], count), travelled, fine)
+        points = nurbs.evaluate(curve, s)
+        pixels = rig.project(points)
+        left, right = (find_crest(f, p) for f, p in zip(fields, pixels, strict=True))
+        outward = np.array([[p[0] - p[1], p[-1] - p[-2]] for p in pixels])
+        outward /= np.maximum(np.linalg.norm(outward, axis=2, keepdims=True), 1e-9)
+        ends_left, ends_right = (
+            (read_end(f, p), read_end(f, p[::-1])) for f, p in zip(fields, pixels, strict=True)
+        )
+        return cls(
+            s,
+            points,
+            float(travelled[-1]),
+            rig.projection_jacobian(points),
+            (left, right),
+            outward,
+            (ends_left, ends_right),
         )
 
+    @property
+    def noise_px(self) -> float:
+        """Root mean square of the offsets from curve to crest, px."""
+        squares = sum((c.trust * c.offsets**2).sum() for c in self.crests)
+        return float(np.sqrt(squares / max(sum(c.trust.sum() for c in self.crests), 1e-9)))
 
-_STAY = 0.03
+
+def refine(curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig) -> tuple[Nurbs, Samples]:
+    """Gauss-Newton on the crests of both views, as smooth as the evidence says.
+
+    Bending is measured in pixels, across the line of sight and in disparity apart, because the
+    images inform depth far less; how much each is held back follows from the curve itself
+    (MacKay's evidence).
+
+    Args:
+        curve: within a few pixels of the crests; its knots stay.
+        fields: (H, W, 2) left and right.
+        rig: the cameras.
+    """
+    stiffness = np.array([1.0, 100.0])
+    for _ in range(_ROUNDS):
+        samples = Samples.of(curve, fields, rig)
+        curve, stiffness = _step(curve, samples, stiffness)
+    return curve, Samples.of(curve, fields, rig)
 
 
-def _samples(curve: Nurbs, rig: StereoRig) -> tuple[Float64, Float64]:
-    fine = np.linspace(0, 1, 16 * len(curve.control_points))
-    left, right = rig.project(nurbs.evaluate(curve, fine))
-    steps = sum(np.linalg.norm(np.diff(p, axis=0), axis=1) for p in (left, right)) / 2
-    travelled = np.r_[0, np.cumsum(steps)]
-    count = max(int(travelled[-1] / _SPACING_PX), 4 * len(curve.control_points))
-    s = np.interp(np.linspace(0, travelled[-1], count), travelled, fine)
-    return s, nurbs.evaluate(curve, s)
+def _step(curve: Nurbs, samples: Samples, stiffness: Float64) -> tuple[Nurbs, Float64]:
+    noise = max(samples.noise_px, _LEAST_NOISE_PX) ** 2
+    data, pull = _crest_equations(curve, samples)
+    _add_ends(data, pull, samples, noise)
+    across, bends = _bending_equations(curve, samples)
+    c = curve.control_points.ravel()
+    free = len(c) // 3 - 2
+    step = np.zeros_like(c)
+    for _ in range(_EVIDENCE_STEPS):
+        factor = data / noise + stiffness[0] * across + stiffness[1] * bends
+        if not spline.factorize(factor):
+            raise FloatingPointError("the curve is not held by the images")
+        smoothing = stiffness[0] * across + stiffness[1] * bends
+        step = spline.solve_factorized(factor, pull / noise - _times(smoothing, c))
+        inverse = spline.band_of_inverse(factor)
+        for k, (energy, rank) in enumerate(((across, 2 * free), (bends, free))):
+            held = rank - stiffness[k] * _trace(inverse, energy)
+            bend = (c + step) @ _times(energy, c + step)
+            stiffness[k] = min(max(held, 1.0) / max(bend, 1e-12), _STIFFEST)
+    points = curve.control_points + step.reshape(-1, 3)
+    return nurbs.curve_from(curve.degree, curve.knots, points), stiffness
+
+
+def _crest_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, Float64]:
+    first, table = spline.local_basis(samples.s, curve.knots)
+    band, gradient = _empty(curve)
+    for crest, jacobian in zip(samples.crests, samples.jacobians, strict=True):
+        rows = np.einsum("ki,kij->kj", crest.normals, jacobian)
+        weighted = crest.trust[:, None] * rows
+        information = weighted[:, :, None] * rows[:, None]
+        pull = weighted * crest.offsets[:, None]
+        spline.add_rows(first, table[0], information, pull, band, gradient)
+    image = _image_axes(samples)
+    stay = _STAY * np.einsum("kij,kil->kjl", image, image)
+    spline.add_rows(first, table[0], stay, np.zeros((len(stay), 3)), band, gradient)
+    return band, gradient
+
+
+def _add_ends(band: Float64, gradient: Float64, samples: Samples, noise: float) -> None:
+    """Rows that draw the ends of the curve along itself to those of the thread."""
+    for view, jacobian in enumerate(samples.jacobians):
+        for end in (0, 1):
+            reading = samples.ends[view][end]
+            if np.isnan(reading.offset_px):
+                continue
+            row = samples.outward[view, end] @ jacobian[-end]
+            weight = noise / _END_NOISE_PX**2
+            at = (len(gradient) - 3) * end
+            offset = np.clip(reading.offset_px, -_LARGEST_END_STEP_PX, _LARGEST_END_STEP_PX)
+            gradient[at : at + 3] += weight * offset * row
+            for a in range(3):
+                for b in range(a + 1):
+                    band[at + a, a - b] += weight * row[a] * row[b]
+
+
+def _bending_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, Float64]:
+    """Bands of the bending across the line of sight and of that in disparity.
+
+    Disparity may bend more where the thread visibly bends more.
+    """
+    first, table = spline.local_basis(samples.s, curve.knots)
+    second = table[2] / samples.length_px**2 * np.sqrt(samples.length_px / len(samples.s))
+    image = _image_axes(samples)
+    across = image[:, :2]
+    bend = np.einsum("kij,kj->ki", across, spline.combine(first, second, curve.control_points))
+    squared = gaussian_filter1d((bend**2).sum(1), _BEND_SAMPLES)
+    freedom = squared / max(squared.mean(), 1e-12) + _LEAST_FREEDOM
+    bands = []
+    for rows, weights in ((across, np.ones_like(freedom)), (image[:, 2:], 1 / freedom)):
+        band, gradient = _empty(curve)
+        information = weights[:, None, None] * np.einsum("kij,kil->kjl", rows, rows)
+        spline.add_rows(first, second, information, np.zeros((len(rows), 3)), band, gradient)
+        bands.append(band)
+    return bands[0], bands[1]
+
+
+def _image_axes(samples: Samples) -> Float64:
+    """(k, 3, 3) derivatives of u and v in the left view and of the disparity."""
+    left, right = samples.jacobians
+    return np.concatenate([left, (left - right)[:, :1]], axis=1)
+
+
+def _empty(curve: Nurbs) -> tuple[Float64, Float64]:
+    n = curve.control_points.size
+    return np.zeros((n, spline.BANDWIDTH)), np.zeros(n)
+
+
+def _times(band: Float64, x: Float64) -> Float64:
+    """Product of a symmetric matrix, given by its lower band, and a vector."""
+    out = band[:, 0] * x
+    for d in range(1, band.shape[1]):
+        out[d:] += band[d:, d] * x[:-d]
+        out[:-d] += band[d:, d] * x[d:]
+    return out
+
+
+def _trace(inverse: Float64, band: Float64) -> float:
+    """Trace of the product of two symmetric matrices, of which one has no entries off the band."""
+    return float((inverse[:, 0] * band[:, 0]).sum() + 2 * (inverse[:, 1:] * band[:, 1:]).sum())

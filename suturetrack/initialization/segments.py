@@ -16,6 +16,8 @@ _SHORTEST = 4
 """Points; what is shorter says nothing about direction."""
 _DIRECTION_REACH = 7
 """Points from an end over which its direction is taken."""
+_END_REACH = 15
+"""Points from an end over which its strength is taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +55,29 @@ def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
     return Ridges(field, magnitude, segments)
 
 
-def end_directions(segments: tuple[Float64, ...]) -> tuple[Float64, Float64]:
-    """(2n, 2) positions of the ends, start and end of each segment in turn, and the unit vectors
-    that point out of the segment there."""
-    positions = np.array([s[i] for s in segments for i in (0, -1)]).reshape(-1, 2)
-    inside = [
-        s[i]
-        for s in segments
-        for i in (min(_DIRECTION_REACH, len(s)) - 1, -min(_DIRECTION_REACH, len(s)))
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """The ends of all segments: end 2i is the start of segment i, 2i + 1 its end."""
+
+    positions: Float64
+    """(2n, 2) pixels."""
+    outward: Float64
+    """(2n, 2) unit vectors out of the segments."""
+    strengths: Float64
+    """(2n,) mean ||V|| of the last stretch."""
+
+
+def find_ends(ridges: Ridges) -> Ends:
+    """The ends of the segments, in order."""
+    pieces = [
+        piece for s in ridges.segments for piece in (s[:_END_REACH], s[: -_END_REACH - 1 : -1])
     ]
-    outward = positions - np.array(inside).reshape(-1, 2)
-    return positions, outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    positions = np.array([p[0] for p in pieces]).reshape(-1, 2)
+    inside = np.array([p[min(_DIRECTION_REACH, len(p)) - 1] for p in pieces]).reshape(-1, 2)
+    outward = positions - inside
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    strengths = np.array([ridges.sample(p[len(p) // 4 :]).mean() for p in pieces])
+    return Ends(positions, outward, strengths)
 
 
 def _sub_pixel(field: Float32, magnitude: Float32, pixels: Float64) -> Float64:

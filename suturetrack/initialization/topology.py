@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from suturetrack.initialization.model import InitializationConfig
-from suturetrack.initialization.segments import Ridges, end_directions
-from suturetrack.types import Float64
+from suturetrack.initialization.segments import Ends, Ridges, find_ends
+from suturetrack.types import Bool, Float64
 
 _TOUCHING_PX = 6.0
 """Ends this near over ridge belong together at any angle: a sharp bend."""
@@ -15,12 +16,14 @@ _TOUCHING_PX = 6.0
 
 def merge_ends(ridges: Ridges, config: InitializationConfig) -> dict[int, int]:
     """Pairs up the ends that match best; end 2i is the start of segment i, 2i + 1 its end."""
-    positions, outward = end_directions(ridges.segments)
-    pairs = cKDTree(positions).query_pairs(config.gap_px, output_type="ndarray")
+    if not ridges.segments:
+        return {}
+    ends = find_ends(ridges)
+    pairs = cKDTree(ends.positions).query_pairs(config.gap_px, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
     if len(pairs) == 0:
         return {}
-    cost, touching = _merge_costs(ridges, positions, outward, pairs, config)
+    cost, touching = _merge_costs(ridges, ends, pairs, config)
     partner: dict[int, int] = {}
     for wanted in (cost < 1, touching):
         for k in np.argsort(cost):
@@ -46,14 +49,11 @@ def follow(start: int, partner: dict[int, int]) -> list[int]:
 
 
 def _merge_costs(
-    ridges: Ridges,
-    positions: Float64,
-    outward: Float64,
-    pairs: Float64,
-    config: InitializationConfig,
-) -> tuple[Float64, Float64]:
+    ridges: Ridges, ends: Ends, pairs: NDArray[np.int64], config: InitializationConfig
+) -> tuple[Float64, Bool]:
     """What each joint costs, 1 being the most that is accepted, and whether the ends touch."""
     i, j = pairs.T
+    positions, outward = ends.positions, ends.outward
     across = positions[j] - positions[i]
     distance = np.linalg.norm(across, axis=1)
     direction = across / np.maximum(distance, 1e-9)[:, None]
@@ -68,6 +68,7 @@ def _merge_costs(
     limit = np.radians(config.merge_angle_deg) / (1 + missing / config.gap_px)
     cost = (turn / limit) ** 2 + sure * (aside / limit) ** 2 + missing / config.gap_px
     cost += 0.3 * distance / config.gap_px
+    cost += 0.5 * np.log(ends.strengths[i] / ends.strengths[j]) ** 2
     touching = (distance < _TOUCHING_PX) & (seen.min(1) * config.high >= config.low)
     return cost, touching
 

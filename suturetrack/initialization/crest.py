@@ -1,0 +1,53 @@
+"""Where the field shows the thread's centre beside a curve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from suturetrack.kernels import search
+from suturetrack.types import Float32, Float64
+
+_OFFSETS = np.arange(-4.0, 4.01, 0.5)
+"""Where the crest is looked for across the curve, px."""
+_NEAR_PX = 2.0
+"""How far the crest is expected from the curve, px (standard deviation)."""
+_CENTROID_REACH = 4
+"""Offsets on each side of the peak whose centroid is the crest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crest:
+    """Where one view shows the crest beside the samples of a curve."""
+
+    normals: Float64
+    """(k, 2) unit normals of the projected curve."""
+    offsets: Float64
+    """(k,) signed distance from the curve to the crest along the normal, px; 0 where it is unseen."""
+    response: Float64
+    """(k,) eq. (4)'s integrand at the crest, in [0, 1]; 0 where it is unseen."""
+
+    @property
+    def trust(self) -> Float64:
+        """(k,) weights of the offsets: crests far off are more often another's."""
+        return self.response / (1 + self.offsets**2)
+
+
+def find_crest(field: Float32, pixels: Float64) -> Crest:
+    """Looks for the crest across (k, 2) evenly spaced pixels of a projected curve."""
+    tangents = np.gradient(pixels, axis=0)
+    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+    profiles = search.normal_profiles(field, pixels, tangents, _OFFSETS)
+    expected = profiles * np.exp(-0.5 * (_OFFSETS / _NEAR_PX) ** 2)
+    peak = np.argmax(expected, axis=1)
+    around = np.arange(-_CENTROID_REACH, _CENTROID_REACH + 1)
+    index = np.clip(peak[:, None] + around, 0, len(_OFFSETS) - 1)
+    window = np.take_along_axis(profiles, index, 1)
+    window = np.maximum(window - window.min(1, keepdims=True), 0) ** 2
+    total = window.sum(1)
+    seen = (peak > 0) & (peak < len(_OFFSETS) - 1) & (total > 0)
+    offsets = (window * _OFFSETS[index]).sum(1) / np.maximum(total, 1e-12)
+    heights = np.take_along_axis(profiles, peak[:, None], 1)[:, 0]
+    normals = np.c_[-tangents[:, 1], tangents[:, 0]]
+    return Crest(normals, np.where(seen, offsets, 0.0), np.where(seen, heights, 0.0))
