@@ -52,7 +52,7 @@ def frame(frame: StereoFrame, level: Level) -> Iterator[Entry]:
         if level == "full":
             yield (
                 f"/rig/{view}/image",
-                rr.Image(image, color_model="BGR"[: image[0, 0].size] or "L"),
+                rr.Image(image, color_model="BGR" if image.ndim == 3 else "L"),
             )
         else:
             yield f"/rig/{view}/image", jpeg(image)
