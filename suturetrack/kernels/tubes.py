@@ -118,8 +118,8 @@ def shade(
         path: as for `splat`.
         light: (n, 4) cosines of the light, then of the highlight, with the direction across the strand
             and with the direction to the viewer.
-        colour: (n, 3) BGR along the strand, 0 to 255.
-        gloss: (3,) share of ambient light, strength and exponent of the highlight.
+        colour: (3,) BGR of the strand, 0 to 255.
+        gloss: (4,) share of ambient light, strength and exponent of the highlight, opacity.
         fragments: where they are.
     """
     _, _, link, value, used = fragments
@@ -142,9 +142,9 @@ def shade(
         diffuse = max(x * light[i, 0] + front * light[i, 1], 0.0)
         shine = max(x * light[i, 2] + front * light[i, 3], 0.0) ** gloss[2] * gloss[1] * 255.0
         value[entry, 2] = path[i, 2] + inside * (path[i + 1, 2] - path[i, 2])
-        value[entry, 3] = cover
+        value[entry, 3] = cover * gloss[3]
         for c in range(3):
-            value[entry, 4 + c] = colour[i, c] * (gloss[0] + (1.0 - gloss[0]) * diffuse) + shine
+            value[entry, 4 + c] = colour[c] * (gloss[0] + (1.0 - gloss[0]) * diffuse) + shine
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)

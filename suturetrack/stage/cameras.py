@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -46,6 +46,24 @@ def make_rig(name: str, size: tuple[int, int]) -> StereoRig:
     return StereoRig.from_calibration(size, (matrix, none), (matrix, none), np.eye(3), shift, 1e-3)
 
 
+def misalign(
+    rig: StereoRig, rng: np.random.Generator, error_px: float, half_pixel: bool
+) -> StereoRig:
+    """What the cameras really are when their calibration says `rig`: off by about `error_px`, and
+    with pixels counted from their corners where `half_pixel` is set.
+    """
+    cameras = []
+    for camera in (rig.left, rig.right):
+        focal = camera.projection[0, 0]
+        turn = Rotation.from_rotvec(rng.normal(0, error_px / focal / np.sqrt(2), 3))
+        change = np.diag([1 + rng.normal(0, error_px / focal)] * 2 + [1.0])
+        change[:2, 2] = 0.5 * half_pixel
+        matrix = camera.projection[:, :3]
+        homography = change @ matrix @ turn.as_matrix() @ np.linalg.inv(matrix)
+        cameras.append(replace(camera, projection=homography @ camera.projection))
+    return replace(rig, left=cameras[0], right=cameras[1])
+
+
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
     """The pose of the table (x and y in its plane, z up, mm) in the rectified left frame."""
@@ -87,6 +105,22 @@ def choose_viewpoint(
                 if _inside(rig, view.to_camera(points), margin):
                     return view
     return view
+
+
+def push_out(
+    view: Viewpoint, rig: StereoRig, rest: Float64, away: Float64, margin: float
+) -> Viewpoint:
+    """The view moved sideways, so that (N, 3) points at rest just stay inside and `away` is nearest
+    to the border; `away` is the (3,) direction on the table in which something leaves.
+    """
+    step = (view.rotation @ away)[:2]
+    step, last = np.r_[step / np.linalg.norm(step), 0.0], view
+    for shift in np.arange(0.0, 200.0, 0.5):
+        moved = Viewpoint(view.rotation, view.translation + shift * step)
+        if not _inside(rig, moved.to_camera(rest), margin):
+            break
+        last = moved
+    return last
 
 
 def _look_at(

@@ -78,9 +78,3 @@ def smoothing_matrix(nodes: int, samples: int) -> Float64:
     """(samples, nodes): evenly spaced samples of the cubic spline through the nodes."""
     spline = CubicSpline(np.arange(nodes), np.eye(nodes))
     return np.asarray(spline(np.linspace(0, nodes - 1, samples)))
-
-
-def with_length(points: Float64, length: float) -> Float64:
-    """The (N, 3) polyline scaled about its first point to that length."""
-    present = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
-    return points[0] + (points - points[0]) * (length / present)

@@ -5,17 +5,28 @@ from __future__ import annotations
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import tubes
-from suturetrack.stage import appearance
-from suturetrack.stage.appearance import COLOURS, DEFAULT_PICTURE, Picture
-from suturetrack.stage.background import TEXTURES, look
-from suturetrack.stage.cameras import RIGS, choose_viewpoint, make_rig
-from suturetrack.stage.motion import Motion, Warp, load_motion, smoothing_matrix, with_length
+from suturetrack.metrics import polyline_length
+from suturetrack.stage import appearance, background, clutter
+from suturetrack.stage.appearance import COLOURS, Look, Picture
+from suturetrack.stage.background import TEXTURES
+from suturetrack.stage.cameras import (
+    RIGS,
+    Viewpoint,
+    choose_viewpoint,
+    make_rig,
+    misalign,
+    push_out,
+)
+from suturetrack.stage.painter import Painter, Strand, gripper_strands
+from suturetrack.stage.play import Play
 from suturetrack.stage.scenarios import SCENARIOS, Scenario
-from suturetrack.types import Bool, Float64, Image, InputError, Stamp, Truth
+from suturetrack.types import Bool, Float32, Float64, Image, InputError, Stamp, Truth
 
-_LENS_BLUR_PX = 0.55
+DEFAULT_PICTURE = Picture()
 _SAMPLES_PER_PX = 0.8
+_MARGIN = 0.05
+_HOLE_RADIUS = 0.9
+_MOST_EXPOSURES = 12
 
 
 def open_scene(
@@ -25,6 +36,8 @@ def open_scene(
     size: tuple[int, int] = (640, 480),
     fps: float = 30.0,
     picture: Picture = DEFAULT_PICTURE,
+    calibration_error_px: float = 0.0,
+    half_pixel: bool = False,
 ) -> Scene:
     """The scenario `name`, varied by `seed`, seen by the rig with that name.
 
@@ -35,25 +48,36 @@ def open_scene(
         size: width and height of the images, px.
         fps: frames a second.
         picture: how the images look.
+        calibration_error_px: how far the real cameras are off their calibration, about, px.
+        half_pixel: whether the real cameras count pixels from corners, not from centres.
 
     Raises:
-        InputError: there is no such scenario, rig, colour or background, or the seed is negative.
+        InputError: there is no such scenario, rig, colour or background, or a number is impossible.
     """
     if name not in SCENARIOS:
         raise InputError(f"no scenario {name!r}; use one of {', '.join(SCENARIOS)}")
     if seed < 0:
         raise InputError(f"seed {seed} of the scene: use a whole number from 0 up")
+    if min(size) < 64 or fps <= 0:
+        raise InputError(
+            f"images of {size[0]}x{size[1]} at {fps} fps: use 64x64 or more, above 0 fps"
+        )
     for what, known in ((picture.thread, COLOURS), (picture.background, TEXTURES)):
         if what is not None and what not in known:
             raise InputError(f"no look {what!r}; use one of {', '.join(known)}")
-    return Scene(SCENARIOS[name], seed, rig, size, fps, picture)
+    told = make_rig(rig, size)
+    rng = np.random.default_rng([seed, 1])
+    real = told
+    if calibration_error_px or half_pixel:
+        real = misalign(told, rng, calibration_error_px, half_pixel)
+    return Scene(SCENARIOS[name], seed, told, real, RIGS[rig].distances, fps, picture)
 
 
 class Scene:
     """Frames and the truth behind them; the same to the bit for the same arguments.
 
     Attributes:
-        rig: the calibrated cameras; lengths in mm.
+        rig: the cameras as calibrated; lengths in mm.
         fps: frames a second.
         frame_count: how many frames there are.
         threads: names of the threads.
@@ -68,58 +92,43 @@ class Scene:
         self,
         scenario: Scenario,
         seed: int,
-        rig: str,
-        size: tuple[int, int],
+        rig: StereoRig,
+        real_rig: StereoRig,
+        distances: tuple[float, float],
         fps: float,
         picture: Picture,
     ) -> None:
         rng = np.random.default_rng(seed)
-        self.rig, self.fps = make_rig(rig, size), fps
-        self.threads = tuple(str(i) for i in range(len(scenario.threads)))
-        self._models = dict(zip(self.threads, scenario.threads, strict=True))
-        self._motion = load_motion(scenario.motion)
-        self._warp = Warp.draw(rng)
-        self._rate, self._start = self._timing(rng, scenario)
+        self.rig, self.fps, self._real_rig = rig, fps, real_rig
         self.frame_count = round(scenario.seconds * fps)
-        everywhere = np.concatenate(
-            [self._warp(t).reshape(-1, 3) for t in self._motion.tracks.values()]
-        )
-        distances = RIGS[rig].distances
-        self._view = choose_viewpoint(rng, self.rig, distances, everywhere, margin=0.05)
-        pixels_per_mm = self.rig.focal / distances[0]
-        self._smoothing = {
-            thread: smoothing_matrix(
-                self._motion.tracks[f"thread{thread}"].shape[1],
-                int(model.length * pixels_per_mm * _SAMPLES_PER_PX),
-            )
-            for thread, model in self._models.items()
+        self._seed, self._scenario = seed, scenario
+        self._play = Play(scenario, rng, _SAMPLES_PER_PX * rig.focal / distances[0])
+        self.threads = self._play.threads
+        self._view = self._choose_view(rng, distances)
+        self._look = Look.draw(rng, picture)
+        self._surfaces = {
+            thread: COLOURS[picture.thread or rng.choice(model.colours)]
+            for thread, model in zip(self.threads, scenario.threads, strict=True)
         }
-        self._light = appearance.Light.draw(rng)
-        self._shadow = self._light.shadow if picture.shadow is None else picture.shadow
-        self._colours = {
-            t: picture.thread or rng.choice(m.colours) for t, m in self._models.items()
-        }
+        self._shutter = scenario.shutter if picture.shutter is None else picture.shutter
+        self._noise = appearance.noise_pool(rng, rig.image_size)
         texture = TEXTURES[picture.background or rng.choice(scenario.backgrounds)](rng)
-        self._backgrounds = look(texture, self.rig, self._view, _LENS_BLUR_PX)
-        self._vignette = appearance.vignetting(size, rng.uniform(0.05, 0.25))
-        self._noise = appearance.noise_pool(rng, size)
-        self._fragments = tubes.make_fragments(size)
-        self._layer = np.zeros((size[1], size[0], 4), np.float32)
-        self._seed, self._picture = seed, picture
+        self._painters = self._set_the_table(rng, texture)
 
     def truth(self, i: int) -> tuple[Truth, ...]:
         """Where every thread is in frame `i`, in the order of `threads`."""
         capture = round(i * 1e9 / self.fps)
         stamp = Stamp(i, capture, capture)
+        tools = [s for s in self._strands(i / self.fps) if s.is_tool]
         truths = []
         for thread in self.threads:
-            points = self._view.to_camera(self._centreline(thread, i / self.fps))
-            length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-            truths.append(Truth(stamp, thread, points, length, self._visible(points)))
+            points = self._view.to_camera(self._play.centreline(thread, i / self.fps))
+            visible = self._visible(points, tools)
+            truths.append(Truth(stamp, thread, points, polyline_length(points), visible))
         return tuple(truths)
 
     def seed_pixel(self, i: int = 0, thread: str | None = None) -> tuple[float, float]:
-        """(u, v) in the raw left image of frame `i` of a visible point well inside the thread.
+        """(u, v) in the raw left image of frame `i`: the middle of what is seen inside the thread.
 
         Raises:
             InputError: there is no such thread.
@@ -128,7 +137,7 @@ class Scene:
         if thread not in self.threads:
             raise InputError(f"no thread {thread!r}; use one of {', '.join(self.threads)}")
         truth = self.truth(i)[self.threads.index(thread)]
-        pixels = self.rig.project_raw(truth.points)[0]
+        pixels = self._real_rig.project_raw(truth.points)[0]
         inner = np.arange(len(pixels) // 5, len(pixels) - len(pixels) // 5)
         shown = inner[truth.visible[inner]]
         chosen = shown[len(shown) // 2] if len(shown) else len(pixels) // 2
@@ -137,100 +146,92 @@ class Scene:
     def render(self, i: int) -> tuple[Image, Image]:
         """The images of frame `i`: (H, W, 3) uint8 BGR, left and right."""
         rng = np.random.default_rng([self._seed, i])
-        strands = [(t, self._centreline(t, i / self.fps)) for t in self.threads]
-        left, right_image = (self._expose(strands, right, rng) for right in (False, True))
-        return left, right_image
+        time = i / self.fps
+        moments = [self._strands(t) for t in self._moments(time)]
+        gain = self._look.gain(time)
+        left, right = (self._expose(painter, moments, gain, rng) for painter in self._painters)
+        return left, right
 
     def _expose(
-        self, strands: list[tuple[str, Float64]], right: bool, rng: np.random.Generator
+        self,
+        painter: Painter,
+        moments: list[list[Strand]],
+        gain: Float32,
+        rng: np.random.Generator,
     ) -> Image:
-        for thread, points in strands:
-            if self._shadow:
-                self._draw_shadow(points, self._models[thread].diameter / 2, right)
-            self._draw(points, thread, right)
-        tubes.composite(self._fragments, self._layer, 1.0)
-        height, width = self._vignette.shape
+        for strands in moments:
+            painter.expose(strands, 1 / len(moments))
+        width, height = self.rig.image_size
         row, column = rng.integers(0, 64, 2)
-        picture = np.empty((height, width, 3), np.uint8)
-        tubes.develop(
-            self._backgrounds[right],
-            self._layer,
-            self._vignette,
-            np.ones(3, np.float32),
-            self._noise[row : row + height, column : column + width],
-            np.float32(self._picture.noise / 16),
-            picture,
-        )
-        return picture
+        picture = painter.develop(gain, self._noise[row : row + height, column : column + width])
+        return appearance.compressed(picture, self._look.jpeg)
 
-    def _draw(self, table_points: Float64, thread: str, right: bool) -> None:
-        points = self._view.to_camera(table_points)
-        colour, gloss = appearance.COLOURS[self._colours[thread]]
-        path = self._path(points, self._models[thread].diameter / 2, right)
-        light = self._view.rotation @ self._light.direction
-        first = self._fragments.used[0]
-        tubes.splat(0, path, 24, self._fragments)
-        tubes.shade(
-            first,
-            path,
-            appearance.shading(points, light),
-            np.tile(np.array(colour), (len(points), 1)),
-            np.array(gloss),
-            self._fragments,
-        )
+    def _moments(self, time: float) -> Float64:
+        """Times spread over the exposure around `time`, one for each pixel that something moves."""
+        open_for = self._shutter / self.fps
+        marks = [_marks(self._strands(time + way * open_for / 2)) for way in (-1, 1)]
+        pixels = [self._real_rig.project_raw(self._view.to_camera(m))[0] for m in marks]
+        moved = float(np.linalg.norm(pixels[1] - pixels[0], axis=1).max())
+        count = int(np.clip(np.ceil(moved / 1.5), 1, _MOST_EXPOSURES))
+        return time + open_for * ((np.arange(count) + 0.5) / count - 0.5)
 
-    def _draw_shadow(self, table_points: Float64, radius: float, right: bool) -> None:
-        height = table_points[::4, 2]
-        light = self._light.direction
-        fallen = table_points[::4] - light * (height / light[2])[:, None]
-        path = self._path(self._view.to_camera(fallen), radius, right)
-        path[:, 4] = np.minimum(np.hypot(path[:, 4], 0.12 * height * path[:, 3] / radius), 3.0)
-        path[:, 2] = np.inf
-        first = self._fragments.used[0]
-        tubes.splat(1, path, 10, self._fragments)
-        tubes.shade(
-            first,
-            path,
-            np.zeros((len(path), 4)),
-            np.zeros((len(path), 3)),
-            np.array([1.0, 0.0, 1.0]),
-            self._fragments,
-        )
-        self._fragments.value[first : self._fragments.used[0], 3] *= self._shadow
-
-    def _path(self, points: Float64, radius: float, right: bool) -> Float64:
-        """(n, 5) for `tubes.splat`."""
-        pixels = self.rig.project_raw(points)[right]
-        depth = points[:, 2]
-        radius_px = radius * self.rig.focal / depth
-        blur = np.full(len(points), np.hypot(_LENS_BLUR_PX, np.sqrt(1 / 12)))
-        return np.ascontiguousarray(np.column_stack([pixels, depth, radius_px, blur]))
-
-    def _centreline(self, thread: str, time: float) -> Float64:
-        """(N, 3) points of the thread at `time` in seconds, table's frame."""
-        nodes = self._motion.at(f"thread{thread}", self._start + self._rate * time)
-        points = self._smoothing[thread] @ self._warp(nodes)
-        return with_length(points, self._models[thread].length)
-
-    def _visible(self, points: Float64) -> Bool:
-        size = np.array(self.rig.image_size)
-        inside = [
-            np.all((view >= -0.5) & (view <= size - 0.5), axis=1)
-            for view in self.rig.project_raw(points)
+    def _strands(self, time: float) -> list[Strand]:
+        strands = [
+            Strand(
+                self._play.centreline(thread, time),
+                np.array([model.diameter / 2]),
+                self._surfaces[thread],
+            )
+            for thread, model in zip(self.threads, self._scenario.threads, strict=True)
         ]
-        return np.asarray(inside[0] & inside[1])
+        gripper = self._play.gripper(time)
+        return strands if gripper is None else strands + gripper_strands(gripper)
 
-    def _timing(self, rng: np.random.Generator, scenario: Scenario) -> tuple[float, float]:
-        """How fast the motion is played, and from which second on."""
-        rate = rng.uniform(0.85, 1.0)
-        if scenario.top_speed is not None:
-            fastest = max(_top_speed(self._motion, n, self._warp) for n in self._motion.tracks)
-            rate *= min(1.0, scenario.top_speed / fastest)
-        spare = max(self._motion.duration - rate * scenario.seconds, 0.0)
-        return rate, rng.uniform(0, spare)
+    def _visible(self, points: Float64, tools: list[Strand]) -> Bool:
+        """(N,) whether both cameras see (N, 3) points: inside the images and behind no tool."""
+        size = np.array(self.rig.image_size)
+        visible = np.ones(len(points), bool)
+        for view in self._real_rig.project_raw(points):
+            visible &= np.all((view >= -0.5) & (view <= size - 0.5), axis=1)
+        for painter in self._painters:
+            for tool in tools:
+                visible &= ~painter.hides(tool, points)
+        return visible
+
+    def _choose_view(self, rng: np.random.Generator, distances: tuple[float, float]) -> Viewpoint:
+        scenario = self._scenario
+        until = 0.0 if scenario.end_leaves else scenario.seconds
+        points = self._play.everywhere(until)
+        view = choose_viewpoint(rng, self.rig, distances, points, _MARGIN)
+        if not scenario.end_leaves:
+            return view
+        ends = np.array([self._play.centreline("0", t)[-1] for t in np.arange(0, 20, 0.25)])
+        away = ends[np.argmax(np.linalg.norm(ends - ends[0], axis=1))] - ends[0]
+        return push_out(view, self.rig, points, away, _MARGIN)
+
+    def _set_the_table(self, rng: np.random.Generator, texture: Float32) -> list[Painter]:
+        start = self._play.centreline("0", 0.0)
+        strays: list[Strand] = []
+        if any(model.length is None for model in self._scenario.threads):
+            texture = background.with_hole(texture, self._play.hole()[:2], _HOLE_RADIUS)
+        if self._scenario.clutter:
+            lines = clutter.misleading_lines(rng, start)
+            texture = background.with_veins(texture, rng, lines, (0.5, 0.8))
+            radius = self._scenario.threads[0].diameter / 2
+            strays = clutter.stray_threads(rng, start, self._surfaces["0"], radius)
+        views = background.look_at(texture, self._real_rig, self._view, self._look.blur_px)
+        focus = float(self._view.to_camera(start)[:, 2].mean())
+        painters = []
+        for right, image in enumerate(views):
+            painter = Painter(self._real_rig, bool(right), self._view, self._look, image, focus)
+            if strays:
+                painter.expose(strays, 1.0)
+                painter.bake()
+            painters.append(painter)
+        return painters
 
 
-def _top_speed(motion: Motion, name: str, warp: Warp) -> float:
-    """Fastest speed of the ends of a track, mm/s."""
-    ends = warp(motion.tracks[name][:, [0, -1]])
-    return float(np.linalg.norm(np.diff(ends, axis=0), axis=2).max()) * motion.rate_hz
+def _marks(strands: list[Strand]) -> Float64:
+    """(16 k, 3) points spread over k strands."""
+    spread = [np.linspace(0, len(s.points) - 1, 16).astype(int) for s in strands]
+    return np.concatenate([s.points[i] for s, i in zip(strands, spread, strict=True)])
