@@ -11,7 +11,7 @@ from services.drawing.common import VIEWS, part
 from suturetrack.types import Float64
 
 PROCESSES = ("source", "segmenter", "tracker")
-_EYE = np.array([-0.8, -0.5, -0.4])
+_EYE = np.array([-1.1, -0.6, -0.3])
 """Where the eye of the view of space is from its target, in distances of the thread."""
 
 
@@ -41,7 +41,7 @@ def blueprint(threads: Sequence[str], target: Float64) -> rrb.Blueprint:
 def _scene(names: Sequence[str], target: Float64) -> rrb.Container:
     images = rrb.Horizontal(*(_view(view, "", "/curve") for view in VIEWS))
     # From the side, with the cameras at one edge and the thread at the other.
-    middle, distance = 0.6 * target, np.linalg.norm(target)
+    middle, distance = 0.7 * target, np.linalg.norm(target)
     eye = rrb.EyeControls3D(
         position=middle + distance * _EYE, look_target=middle, eye_up=(0, -1, 0)
     )
@@ -51,7 +51,8 @@ def _scene(names: Sequence[str], target: Float64) -> rrb.Container:
     contents = ["+ /rig/**", *hidden, *shown]
     space = rrb.Spatial3DView(origin="/rig", name="Space", contents=contents, eye_controls=eye)
     columns = rrb.TextLogColumns(timeline_columns=["frame"], text_log_columns=["LogLevel", "Body"])
-    log = rrb.TextLogView(origin="/log", name="Log", contents="/log/**", columns=columns)
+    rows = rrb.TextLogRows(filter_by_log_level=["INFO", "WARN", "ERROR", "CRITICAL"])
+    log = rrb.TextLogView(origin="/log", name="Log", contents="/log/**", columns=columns, rows=rows)
     return rrb.Vertical(images, rrb.Horizontal(space, log, column_shares=[5, 4]), row_shares=[5, 4])
 
 

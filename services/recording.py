@@ -31,6 +31,7 @@ from suturetrack.types import (
     InputError,
     RidgeField,
     Stamp,
+    Status,
     StereoFrame,
     ThreadState,
     Truth,
@@ -82,7 +83,7 @@ class Recorder:
         """
         self._process, self._level, self._rig = process, level, rig
         self._config, self._flush_seconds, self._part_bytes = config, flush_seconds, part_bytes
-        self._threads: list[str] = []
+        self._statuses: dict[str, Status | None] = {}
         self._target: Float64 | None = None
         self._stream: rr.RecordingStream | None = None
         self._stamp: Stamp | None = None
@@ -133,8 +134,7 @@ class Recorder:
         self._write(stamp, drawing.states(states, self._rig, published_ns))
         self._latency(stamp, published_ns)
         for state in states:
-            for event in state.events:
-                self.log(f"thread {state.thread}: {event}")
+            self._tell(state)
 
     def initialization(
         self, stamp: Stamp, thread: str, result: Initialization | InitializationError
@@ -235,18 +235,28 @@ class Recorder:
 
     def _introduce(self, state: ThreadState) -> None:
         assert self._stream is not None
-        if state.thread not in self._threads:
-            self._threads.append(state.thread)
+        if state.thread not in self._statuses:
+            self._statuses[state.thread] = None
             self._write_static(drawing.thread_style(state.thread))
             self._target = None
         if self._target is None and state.curve is not None:
             self._target = nurbs.evaluate(state.curve, np.array([0.5]))[0]
             self._stream.send_blueprint(self._blueprint())
 
+    def _tell(self, state: ThreadState) -> None:
+        """The state's events and changes of status in words."""
+        name = f"thread {state.thread}"
+        for event in state.events:
+            # Control points come and go all the time, which their plot shows better.
+            self.log(f"{name}: {event}", "DEBUG" if event.startswith("control points") else "INFO")
+        if state.status != self._statuses[state.thread]:
+            self._statuses[state.thread] = state.status
+            self.log(f"{name}: {state.status}", "WARN" if state.status is Status.LOST else "INFO")
+
     def _blueprint(self) -> rrb.Blueprint:
         ahead = np.array([0.0, 0.0, 10 * self._rig.baseline])
         target = ahead if self._target is None else self._target
-        return blueprint.blueprint(self._threads, target)
+        return blueprint.blueprint(list(self._statuses), target)
 
     def _open_part(self) -> None:
         """Directs the stream to the next free file; every part explains itself."""
@@ -263,7 +273,7 @@ class Recorder:
         self._write_static(drawing.cameras(self._rig))
         self._write_static(drawing.process_style(self._process))
         self._write_static(self._about())
-        for thread in self._threads:
+        for thread in self._statuses:
             self._write_static(drawing.thread_style(thread))
 
     def _about(self) -> list[Entry]:

@@ -77,7 +77,7 @@ class ThreadSummary:
     """Share of the frames with each status."""
     losses: list[Loss]
     length_mm: Spread
-    """Of the frames that are not lost."""
+    """Of the frames whose status is `tracking`."""
     true_length_mm: float
     """Mean of the true length; nan without a truth."""
     control_points: Spread
@@ -162,7 +162,7 @@ def _thread(
         first=states[0].state.stamp.frame,
         shares={s: counts[s] / len(states) for s in Status},
         losses=_losses(states),
-        length_mm=Spread.of(length[held]),
+        length_mm=Spread.of(length[status == Status.TRACKING]),
         true_length_mm=true_length.mean,
         control_points=Spread.of(points),
         energies={name: Spread.of(values[held]) for name, values in energies.items()},

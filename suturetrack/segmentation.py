@@ -23,6 +23,8 @@ _WEIGHTS = {
     "green": (0, 256, 0),
     "red": (0, 0, 256),
 }
+# Hue by half the angle in degrees: OpenCV's 180 hues for the directions of half a turn.
+_HUES = (2 * np.arange(256) % 180).astype(np.uint8)
 _SIGNS = {"auto": (1.0, 1.0), "dark": (1.0, 1.0), "bright": (-1.0, -1.0), "both": (-1.0, 1.0)}
 
 
@@ -195,8 +197,7 @@ def direction_image(field_view: Float32) -> Image:
     Returns:
         (H, W, 3) uint8 BGR.
     """
-    length, angle = cv2.cartToPolar(field_view[..., 0], field_view[..., 1])
-    hue = np.rint(angle * (180 / math.pi)) % 180
-    value = np.clip(np.rint(length * 255), 0, 255)
-    hsv = np.dstack([hue, np.full_like(hue, 255), value]).astype(np.uint8)
-    return cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)
+    length, angle = cv2.cartToPolar(*cv2.split(field_view), angleInDegrees=True)
+    hue = cv2.LUT(cv2.convertScaleAbs(angle, alpha=0.5), _HUES)
+    value = cv2.convertScaleAbs(length, alpha=255)
+    return cv2.cvtColor(cv2.merge([hue, np.full_like(hue, 255), value]), cv2.COLOR_HSV2BGR)

@@ -226,7 +226,18 @@ def test_plots_carry_their_units_and_the_log_tells_events(tmp_path: Path, curve:
         assert row(folder, f"/plots/{name}")["Scalars:scalars"].tolist() == values
     assert row(folder, "/plots/0/status")["StateChange:state"].tolist() == ["tracking"]
     texts = [r["TextLog:text"][0] for r in rows(folder, "/log/tracker")]
-    assert texts == ["tracker: thread 0: one control point inserted", "tracker: all is well"]
+    events = ["thread 0: one control point inserted", "thread 0: tracking", "all is well"]
+    assert texts == [f"tracker: {event}" for event in events]
+
+
+def test_the_log_warns_of_every_loss(tmp_path: Path, rig: StereoRig, curve: Nurbs) -> None:
+    course = [*[Status.TRACKING] * 3, *[Status.LOST] * 2, Status.OCCLUDED, *[Status.LOST] * 2]
+    with Recorder(tmp_path, "tracker", "light", rig) as recorder:
+        for i, status in enumerate(course):
+            recorder.states([make_state(curve, status, Stamp(i, i, i))])
+    lines = rows(RunFolder(tmp_path), "/log/tracker")
+    warnings = [r["frame"] for r in lines if r["TextLog:level"][0] == "WARN"]
+    assert warnings == [3, 6]
 
 
 def test_the_growth_can_be_followed_step_by_step(
