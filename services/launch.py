@@ -45,6 +45,7 @@ from suturetrack.types import InputError, Seed
 _GLANCE_S = 0.2
 _LINE_S = 5.0
 """Between two lines where there is no terminal to keep one line up to date."""
+_WIDTH = 110
 _LAST_WORDS_S = 0.3
 
 
@@ -85,6 +86,8 @@ def run(config: RunConfig | DemoConfig) -> None:
         demo = InputConfig(f"stage:{config.scenario}", fps=30.0, frames=600)
         config = RunConfig(demo, config.service, view=config.view)
     console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = _WIDTH
     with ExitStack() as stack:
         rig_name = stack.enter_context(_reserved(config.service))
         config, rig = _resolve(config, rig_name)

@@ -94,7 +94,7 @@ class Monitor:
 
     def _thread_table(self) -> Table:
         table = Table(title=f"Threads, of {self._frames()} frames", title_justify="left")
-        for column in ("thread", "tracked %", "occluded %", "lost %", "length mm", "sigma mm"):
+        for column in ("thread", "tracking %", "occluded %", "lost %", "length mm", "sigma mm"):
             table.add_column(column, justify="right")
         with_truth = any(thread.true_mm for thread in self._threads.values())
         for column in ("true mm", "error %") if with_truth else ():

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Annotated
 
+import cv2
+import numpy as np
 import tyro
 
 from services import topics
 from services.seeding import SeedDesk
 from services.service import Service, ServiceConfig, Stopped
 from services.wire import scaled
+from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationConfig
 from suturetrack.tracking import Tracker, TrackingConfig
-from suturetrack.types import Seed
+from suturetrack.types import RidgeField, Seed, Stamp
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,7 @@ def run(service: Service, config: TrackerConfig) -> None:
     desk = SeedDesk(bus, tracker, rig, config.tracking.patience)
     for i, pixel in enumerate(config.seed):
         desk.seed(Seed(str(i), pixel=pixel))
+    _warm_up(rig, config)
     recorder = service.record(rig, config)
     if config.service.lockstep and not bus.wait_for_readers(topics.STEP):
         raise Stopped
@@ -52,3 +57,25 @@ def run(service: Service, config: TrackerConfig) -> None:
         for thread, result in step.initializations.items():
             recorder.initialization(ridges.stamp, thread, result)
         desk.settle(ridges.stamp, step.initializations)
+
+
+def _warm_up(rig: StereoRig, config: TrackerConfig) -> None:
+    """Compiles (or loads) the kernels on a drawn thread, so that the first frame is not late."""
+    width, height = rig.image_size
+    z = rig.focal * rig.baseline / (0.1 * width)
+    x = np.linspace(-0.25, 0.25, 200) * width * z / rig.focal
+    y = 0.1 * height * z / rig.focal * np.sin(np.linspace(0, 5, 200))
+    thread = np.column_stack([x, y, np.full(200, z)])
+    views = []
+    for pixels in rig.project(thread):
+        view = np.zeros((height, width, 2), np.float32)
+        for start, end in itertools.pairwise(pixels):
+            direction = (end - start) / np.linalg.norm(end - start)
+            first, last = np.rint([start, end]).astype(int).tolist()
+            cv2.line(view, first, last, direction.tolist(), 3)
+        views.append(view)
+    tracker = Tracker(rig, config.tracking, config.initialization)
+    u, v = rig.project_raw(thread[100])[0]
+    tracker.seed(Seed(pixel=(float(u), float(v))))
+    for frame in range(3):
+        tracker.step(RidgeField(Stamp(frame, frame * 33_333_333, 0), views[0], views[1]))

@@ -1,0 +1,182 @@
+"""A synthetic thread through all stages, on the in-memory bus."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services import segmenter, source, topics, tracker
+from services.bus import Bus
+from services.memory_transport import Hub
+from services.messages import Health
+from services.segmenter import SegmenterConfig
+from services.service import Service, ServiceConfig
+from services.source import SourceConfig
+from services.sources import InputConfig
+from services.tracker import TrackerConfig
+from suturetrack import nurbs
+from suturetrack.metrics import curve_error
+from suturetrack.stage import open_scene
+from suturetrack.types import Seed, Status, ThreadState, Truth
+
+FRAMES = 8
+STAGE = InputConfig("stage:figure8-107", frames=FRAMES)
+LOCKSTEP = ServiceConfig(lockstep=True)
+
+
+@dataclass
+class Outcome:
+    states: list[ThreadState]
+    truths: list[Truth]
+    healths: list[Health]
+
+
+class Rig:
+    """Processes as threads around one hub."""
+
+    def __init__(self) -> None:
+        self.hub = Hub()
+        self.threads: dict[str, threading.Thread] = {}
+        self.buses: dict[str, Bus] = {}
+        self.errors: dict[str, BaseException] = {}
+
+    def connect(self, name: str) -> Bus:
+        self.buses[name] = Bus(self.hub.connect(), "rig", name)
+        return self.buses[name]
+
+    def start(self, name: str, module: Any, config: Any) -> None:
+        service = Service(name, config.service, self.connect(name))
+
+        def body() -> None:
+            try:
+                with service:
+                    module.run(service, config)
+            except BaseException as error:
+                self.errors[name] = error
+
+        self.threads[name] = threading.Thread(target=body, name=name, daemon=True)
+        self.threads[name].start()
+
+    def wait(self) -> None:
+        """Until the source is done, or any process fails."""
+        deadline = time.monotonic() + 60
+        while self.threads["source"].is_alive() and not self.errors:
+            assert time.monotonic() < deadline, "the source did not end"
+            time.sleep(0.01)
+
+    def stop(self) -> None:
+        for name, thread in self.threads.items():
+            self.buses[name].stop.set()
+            thread.join(10)
+            assert not thread.is_alive()
+
+
+def drain(inbox: Any) -> list[Any]:
+    return list(iter(lambda: inbox.get(0), None))
+
+
+def play(
+    seed: tuple[tuple[float, float], ...],
+    service: ServiceConfig = LOCKSTEP,
+    stage: InputConfig = STAGE,
+) -> tuple[Outcome, Rig]:
+    rig = Rig()
+    watcher = rig.connect("run")
+    states, truths = watcher.every(topics.STATE), watcher.every(topics.TRUTH)
+    healths = watcher.every(topics.HEALTH)
+    rig.start("source", source, SourceConfig(stage, service))
+    rig.start("segmenter", segmenter, SegmenterConfig(service, seed))
+    rig.start("tracker", tracker, TrackerConfig(service, seed))
+    rig.wait()
+    rig.stop()
+    outcome = Outcome(drain(states), drain(truths), drain(healths))
+    watcher.close()
+    return outcome, rig
+
+
+@pytest.fixture(scope="module")
+def seed() -> tuple[tuple[float, float], ...]:
+    return (open_scene("figure8-107").seed_pixel(0),)
+
+
+@pytest.fixture(scope="module")
+def outcome(seed: tuple[tuple[float, float], ...]) -> Outcome:
+    found, rig = play(seed)
+    assert not rig.errors
+    return found
+
+
+def test_every_frame_gives_a_tracked_state_near_the_truth(outcome: Outcome) -> None:
+    assert [s.stamp.frame for s in outcome.states] == list(range(FRAMES))
+    assert [t.stamp.frame for t in outcome.truths] == list(range(FRAMES))
+    for state, truth in zip(outcome.states, outcome.truths, strict=True):
+        assert state.status is Status.TRACKING
+        assert state.stamp == truth.stamp
+        assert state.curve is not None
+        points = nurbs.evaluate(state.curve, np.linspace(0, 1, 400))
+        # Metres on the wire, although the scene is in millimetres.
+        assert curve_error(points, truth.points).rms < 1e-3
+        assert truth.length == pytest.approx(0.107, rel=1e-3)
+        assert state.length == pytest.approx(truth.length, rel=0.02)
+
+
+def test_every_process_reports_its_health(outcome: Outcome) -> None:
+    last = {health.process: health for health in outcome.healths}
+    assert set(last) == {"source", "segmenter", "tracker"}
+    for health in last.values():
+        assert health.frames == FRAMES
+        assert health.dropped == health.refused == 0
+        assert health.stamp is not None
+        assert health.stamp.frame == FRAMES - 1
+        assert 0 < health.run_latency.p50_ms <= health.run_latency.max_ms
+        assert health.memory_mb > 10
+
+
+def bits(state: ThreadState) -> tuple[bytes, ...]:
+    assert state.curve is not None
+    arrays = (state.curve.control_points, state.curve.knots, state.sigma, state.seen)
+    return (*(array.tobytes() for array in arrays), repr((state.length, state.energies)).encode())
+
+
+def test_lock_step_gives_the_same_twice_to_the_bit(
+    seed: tuple[tuple[float, float], ...], outcome: Outcome
+) -> None:
+    again, _ = play(seed)
+    assert [bits(s) for s in again.states] == [bits(s) for s in outcome.states]
+    times = [s.stamp.capture_ns for s in again.states]
+    assert times == [round(i * 1e9 / 30) for i in range(FRAMES)]
+
+
+def test_a_seed_on_no_thread_ends_the_tracker_with_the_reason() -> None:
+    stage = InputConfig("stage:figure8-107", frames=40)
+    _, rig = play(((5.0, 5.0),), stage=stage)
+    assert "seed (5.0, 5.0)" in str(rig.errors["tracker"])
+
+
+def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
+    rig = Rig()
+    operator = rig.connect("console")
+    states = operator.every(topics.STATE)
+    service = ServiceConfig()
+    rig.start("source", source, SourceConfig(InputConfig("stage:figure8-107"), service))
+    rig.start("segmenter", segmenter, SegmenterConfig(service))
+    rig.start("tracker", tracker, TrackerConfig(service))
+    assert operator.wait_for_alive("segmenter", 60)
+    outside = operator.ask(topics.SEED, Seed("left", pixel=(900.0, 5.0)), 30)
+    nothing = operator.ask(topics.SEED, Seed("left", pixel=(5.0, 5.0)), 30)
+    good = operator.ask(topics.SEED, Seed("right", pixel=seed[0]), 30)
+    state = next(s for s in states if s.thread == "right")
+    rig.stop()
+    assert not outside.accepted
+    assert "outside the 640x480 left image" in outside.reason
+    assert not nothing.accepted
+    assert nothing.stamp is not None
+    assert good.accepted
+    assert good.reason.startswith("found ")
+    assert good.curve is not None
+    assert state.status is Status.TRACKING
