@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -18,7 +19,12 @@ DEGREE = spline.DEGREE
 SPACING_PX = 2.0
 """Distance of the samples that hold the curve, px."""
 _LEAST_NOISE_PX = 0.03
-_ROUNDS = 4
+_DENSE_ROUNDS = 4
+_FINAL_ROUNDS = 3
+_LEAST_SAMPLES = 3
+_SIGNIFICANT = 25.0
+"""Growth of a span's misfit, in units of the noise, that calls for a knot; four more unknowns grow
+with it, and neighbouring samples err alike."""
 _EVIDENCE_STEPS = 3
 _STAY = 0.01
 """Weight, against that of a crest, which keeps samples from sliding along the thread."""
@@ -100,22 +106,71 @@ class Samples:
 
 
 def refine(curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig) -> tuple[Nurbs, Samples]:
-    """Gauss-Newton on the crests of both views, as smooth as the evidence says.
+    """Gauss-Newton on the crests of both views, as smooth as the evidence says, with few knots.
 
     Bending is measured in pixels, across the line of sight and in disparity apart, because the
     images inform depth far less; how much each is held back follows from the curve itself
     (MacKay's evidence).
 
     Args:
-        curve: within a few pixels of the crests; its knots stay.
+        curve: within a few pixels of the crests, with knots enough for any shape.
         fields: (H, W, 2) left and right.
         rig: the cameras.
     """
     stiffness = np.array([1.0, 100.0])
-    for _ in range(_ROUNDS):
-        samples = Samples.of(curve, fields, rig)
-        curve, stiffness = _step(curve, samples, stiffness)
+    for _ in range(_DENSE_ROUNDS):
+        curve, stiffness = _step(curve, Samples.of(curve, fields, rig), stiffness)
+    curve = with_needed_knots(Samples.of(curve, fields, rig))
+    for _ in range(_FINAL_ROUNDS):
+        curve, stiffness = _step(curve, Samples.of(curve, fields, rig), stiffness)
     return curve, Samples.of(curve, fields, rig)
+
+
+def with_needed_knots(samples: Samples) -> Nurbs:
+    """A curve through the samples with as few knots as the crests allow.
+
+    Spans are halved, by misfit, until none fits the crests significantly worse than the samples do.
+    """
+    information = sum(_information(samples), start=_stay(samples))
+    noise = max(samples.noise_px, _LEAST_NOISE_PX) ** 2
+    interior = np.array([0.5])
+    while True:
+        curve = _closest(nurbs.clamped_knots(interior, DEGREE), samples, information)
+        moved = nurbs.evaluate(curve, samples.s) - samples.points
+        excess = np.zeros(len(samples.s))
+        for crest, jacobian in zip(samples.crests, samples.jacobians, strict=True):
+            shift = np.einsum("ki,kij,kj->k", crest.normals, jacobian, moved)
+            excess += crest.trust * ((crest.offsets - shift) ** 2 - crest.offsets**2)
+        new = _splits(samples.s, excess / noise, interior)
+        if not new:
+            return curve
+        interior = np.sort(np.r_[interior, new])
+
+
+def _splits(s: Float64, excess: Float64, interior: Float64) -> list[float]:
+    """Where spans with too much misfit are to be divided."""
+    bounds = [0, *np.searchsorted(s, interior).tolist(), len(s)]
+    new = []
+    for a, b in pairwise(bounds):
+        if b - a < 2 * _LEAST_SAMPLES or excess[a:b].sum() < _SIGNIFICANT:
+            continue
+        grown = np.cumsum(np.maximum(excess[a:b], 0))
+        middle = int(np.searchsorted(grown, grown[-1] / 2))
+        new.append(float(s[a + min(max(middle, _LEAST_SAMPLES), b - a - _LEAST_SAMPLES)]))
+    return new
+
+
+def _closest(knots: Float64, samples: Samples, information: Float64) -> Nurbs:
+    """The curve closest to the samples where (k, 3, 3) `information` says that it matters."""
+    first, table = spline.local_basis(samples.s, knots)
+    count = len(knots) - DEGREE - 1
+    band, gradient = np.zeros((3 * count, spline.BANDWIDTH)), np.zeros(3 * count)
+    pull = np.einsum("kij,kj->ki", information, samples.points)
+    spline.add_rows(first, table[0], information, pull, band, gradient)
+    if not spline.factorize(band):
+        raise FloatingPointError("the samples do not hold the curve")
+    points = spline.solve_factorized(band, gradient).reshape(-1, 3)
+    return nurbs.curve_from(DEGREE, knots, points)
 
 
 def _step(curve: Nurbs, samples: Samples, stiffness: Float64) -> tuple[Nurbs, Float64]:
@@ -144,16 +199,29 @@ def _step(curve: Nurbs, samples: Samples, stiffness: Float64) -> tuple[Nurbs, Fl
 def _crest_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, Float64]:
     first, table = spline.local_basis(samples.s, curve.knots)
     band, gradient = _empty(curve)
+    views = zip(samples.crests, samples.jacobians, _information(samples), strict=True)
+    for crest, jacobian, information in views:
+        rows = np.einsum("ki,kij->kj", crest.normals, jacobian)
+        pull = (crest.trust * crest.offsets)[:, None] * rows
+        spline.add_rows(first, table[0], information, pull, band, gradient)
+    nothing = np.zeros((len(samples.s), 3))
+    spline.add_rows(first, table[0], _stay(samples), nothing, band, gradient)
+    return band, gradient
+
+
+def _information(samples: Samples) -> list[Float64]:
+    """What the crests of each view say about a sample's place in space, each (k, 3, 3)."""
+    information = []
     for crest, jacobian in zip(samples.crests, samples.jacobians, strict=True):
         rows = np.einsum("ki,kij->kj", crest.normals, jacobian)
-        weighted = crest.trust[:, None] * rows
-        information = weighted[:, :, None] * rows[:, None]
-        pull = weighted * crest.offsets[:, None]
-        spline.add_rows(first, table[0], information, pull, band, gradient)
+        information.append(crest.trust[:, None, None] * rows[:, :, None] * rows[:, None])
+    return information
+
+
+def _stay(samples: Samples) -> Float64:
+    """(k, 3, 3) what keeps the samples from sliding along the thread."""
     image = _image_axes(samples)
-    stay = _STAY * np.einsum("kij,kil->kjl", image, image)
-    spline.add_rows(first, table[0], stay, np.zeros((len(stay), 3)), band, gradient)
-    return band, gradient
+    return _STAY * np.einsum("kij,kil->kjl", image, image)
 
 
 def _add_ends(band: Float64, gradient: Float64, samples: Samples, noise: float) -> None:

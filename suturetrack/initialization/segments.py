@@ -39,8 +39,7 @@ class Ridges:
 
 def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
     """Crest lines of an (H, W, 2) field, split at junctions; weak and tiny ones are left out."""
-    # Not cv2.magnitude: its last bits depend on where the arrays lie in memory.
-    magnitude = np.sqrt(field[..., 0] ** 2 + field[..., 1] ** 2)
+    magnitude = cv2.magnitude(field[..., 0], field[..., 1])
     mask = crest.crest_pixels(field, magnitude, config.low)
     crest.thin(mask, magnitude)
     pixels, starts = crest.trace_chains(mask)
