@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from suturetrack.types import Float32, Float64
+from suturetrack.types import Bool, Float32, Float64
 
 Int64 = NDArray[np.int64]
 
@@ -40,6 +40,25 @@ def responses(field: Float32, pixels: Float64, tangents: Float64) -> Float64:
     out = np.empty(len(pixels))
     for j in range(len(pixels)):
         out[j] = response_at(field, pixels[j, 0], pixels[j, 1], tangents[j, 0], tangents[j, 1])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def magnitudes(field: Float32, pixels: Float64) -> Float64:
+    """(k,) bilinear |V| at (k, 2) pixels; 0 outside the image."""
+    height, width = field.shape[0], field.shape[1]
+    out = np.zeros(len(pixels))
+    for j in range(len(pixels)):
+        u, v = pixels[j, 0], pixels[j, 1]
+        if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+            continue
+        column, row = min(int(u), width - 2), min(int(v), height - 2)
+        fu, fv = u - column, v - row
+        for i in range(2):
+            for h in range(2):
+                x, y = field[row + i, column + h, 0], field[row + i, column + h, 1]
+                share = (fv if i else 1 - fv) * (fu if h else 1 - fu)
+                out[j] += share * np.sqrt(x * x + y * y)
     return out
 
 
@@ -127,3 +146,21 @@ def peaks(profiles: Float64, path: Int64, half: int) -> tuple[Float64, Float64]:
         if bend < 0:
             position[j] = i + min(max(-linear / square / (2 * bend), -1.0), 1.0)
     return position, height
+
+
+@numba.njit(cache=True, nogil=True)
+def solid(flags: Bool, lengths: Float64, least: float) -> Bool:
+    """(k,) `flags` without the runs whose total of `lengths` is below `least`."""
+    kept = flags.copy()
+    j = 0
+    while j < len(flags):
+        if not flags[j]:
+            j += 1
+            continue
+        start, total = j, 0.0
+        while j < len(flags) and flags[j]:
+            total += lengths[j]
+            j += 1
+        if total < least:
+            kept[start:j] = False
+    return kept

@@ -93,6 +93,17 @@ def combine(first: Int64, values: Float64, control_points: Float64) -> Float64:
 
 
 @numba.njit(cache=True, nogil=True)
+def gather(first: Int64, values: Float64, points: Float64) -> Float64:
+    """(n + 1, dim) sums A.T P of the (k, dim) samples: the transpose of `combine`."""
+    sums = np.zeros((first[-1] + ORDER, points.shape[1]))
+    for j in range(len(first)):
+        for i in range(ORDER):
+            for a in range(points.shape[1]):
+                sums[first[j] + i, a] += values[j, i] * points[j, a]
+    return sums
+
+
+@numba.njit(cache=True, nogil=True)
 def add_rows(
     first: Int64,
     values: Float64,
@@ -174,6 +185,18 @@ def band_of_inverse(factor: Float64) -> Float64:
                 total -= factor[m, m - r] * inverse[high, high - low]
             inverse[c, c - r] = total / factor[r, 0]
     return inverse
+
+
+@numba.njit(cache=True, nogil=True)
+def diagonal_blocks(band: Float64) -> Float64:
+    """(n + 1, 3, 3) blocks on the diagonal of a symmetric lower band."""
+    count = len(band) // 3
+    blocks = np.empty((count, 3, 3))
+    for i in range(count):
+        for a in range(3):
+            for b in range(a + 1):
+                blocks[i, a, b] = blocks[i, b, a] = band[3 * i + a, a - b]
+    return blocks
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,0 +1,62 @@
+"""What can be set about tracking."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class PaperConfig:
+    """The parameters that the paper leaves open."""
+
+    gain: float = 3.0
+    """b of eq. (5), px per unit of the field's slope."""
+    end_gain: float = 6.0
+    """The same for the ends, eq. (8)."""
+    iterations: int = 12
+    """Updates a field."""
+    samples_per_control_point: int = 5
+    """Points of the curve that forces act on."""
+    search_px: float = 6.0
+    """How far active search looks to each side."""
+    flat_px: float = 0.1
+    """A force below this leaves the point to active search."""
+    largest_step_px: float = 2.0
+    """Longest step of a point in one update."""
+    end_search: bool = True
+    """Whether ends that feel no force are searched for along the tangent."""
+    end_search_step_px: float = 1.0
+    """Step of that search."""
+    spacing_px: tuple[float, float] = (10.0, 26.0)
+    """Distance of neighbouring control points below which one is pruned, above which one is inserted."""
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """How threads are followed from field to field."""
+
+    method: Literal["gauss-newton", "paper"] = "gauss-newton"
+    """gauss-newton: sub-pixel offsets along the normals and a banded least-squares step; paper: the
+    forces and updates of eqs. (4)-(16)."""
+    search_px: float = 5.0
+    """How far to each side of the predicted curve the thread is looked for first."""
+    wide_search_px: float = 32.0
+    """How far it is looked for when the first search does not find it."""
+    iterations: int = 3
+    """Gauss-Newton steps a field."""
+    noise_px: float = 0.1
+    """Standard deviation of a centreline offset measured in the field."""
+    drift_px: float = 2.0
+    """How far the thread may leave the prediction from one field to the next, as a standard
+    deviation; unseen stretches are held to the prediction by this."""
+    smoothing: float = 30.0
+    """Weight of the curve's bending; without unit."""
+    stretch: float = 0.02
+    """Standard deviation of the local stretch of the curve, relative."""
+    samples_per_span: int = 5
+    """Places between two knots where the images are searched."""
+    paper: PaperConfig = PaperConfig()
+    """Parameters of the method `paper`."""
+    patience: int = 30
+    """Fields in which the thread is looked for after a seed before it is given up."""

@@ -1,0 +1,136 @@
+"""Control points by need: more in bends, fewer on straights, the curve unchanged (Section VI-D.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.kernels import spline
+from suturetrack.kernels.spline import Int64
+from suturetrack.nurbs import clamped_knots, curve_from, evaluate, insert_knot
+from suturetrack.tracking.sampling import Samples, View, views
+from suturetrack.types import Float64, Nurbs
+
+# A span of length h on a circle of radius r is off by about h^4 / (384 r^3).
+_TOLERANCE_PX = 0.05
+_SPACING_PX = (8.0, 32.0)
+_MOST = 120
+_CROWDED = 1.0
+_SPARSE = 1.5
+
+
+def rearrange(curve: Nurbs, moving: Float64, rig: StereoRig) -> tuple[Nurbs, Float64, int, int]:
+    """Inserts and removes knots where the shape asks for it.
+
+    Args:
+        curve: cubic, 3-D.
+        moving: (n + 1, m) coefficients of functions on the same knots, carried along.
+
+    Returns:
+        The curve, the carried coefficients, and how many control points were inserted and removed.
+    """
+    edges = np.unique(curve.knots)
+    width, wanted = _spans(curve, rig)
+    crowded = _crowded(width, wanted)
+    both = curve_from(3, curve.knots, np.c_[curve.control_points, moving])
+    if len(crowded):
+        both = refit(both, np.delete(edges[1:-1], crowded))
+        edges = np.unique(both.knots)
+        width, wanted = _spans(_spatial(both), rig)
+    sparse = np.flatnonzero(width > _SPARSE * wanted)
+    for i in sparse:
+        both = insert_knot(both, float(edges[i] + edges[i + 1]) / 2)
+    return _spatial(both), both.control_points[:, 3:], len(sparse), len(crowded)
+
+
+def respace(
+    curve: Nurbs, moving: Float64, rig: StereoRig, spacing_px: tuple[float, float]
+) -> tuple[Nurbs, Float64, int, int]:
+    """The paper's rule: prunes control points that are too close and inserts where the gap is large.
+
+    Takes and returns what `rearrange` does; `spacing_px` is the range of the gaps.
+    """
+    left, right = rig.project(curve.control_points)
+    gaps = np.linalg.norm(np.diff((left + right) / 2, axis=0), axis=1)
+    both = curve_from(3, curve.knots, np.c_[curve.control_points, moving])
+    close = [int(i) for i in np.flatnonzero(gaps[1:-2] + gaps[2:-1] < 2 * spacing_px[0])]
+    close = [i for n, i in enumerate(close) if n == 0 or close[n - 1] < i - 1]
+    wide = _midpoints(curve.knots, np.flatnonzero(gaps > spacing_px[1]))
+    for s in wide:
+        both = insert_knot(both, s)
+    if close:
+        near = {float(curve.knots[i + 4]) for i in close if i + 4 < len(curve.knots) - 4}
+        interior = np.unique(both.knots)[1:-1]
+        both = refit(both, interior[~np.isin(interior, list(near))])
+    return _spatial(both), both.control_points[:, 3:], len(wide), len(close)
+
+
+def _midpoints(knots: Float64, gaps: Int64) -> list[float]:
+    """Parameters midway between the control points on both sides of each gap, clear of knots."""
+    reach = np.stack([knots[gaps + 2 + i] for i in range(2)])
+    middle = reach.mean(axis=0)
+    return [float(s) for s in np.unique(middle) if np.abs(knots - s).min() > 1e-6]
+
+
+def refit(curve: Nurbs, interior: Float64) -> Nurbs:
+    """The closest cubic curve on other interior knots; exact where they contain the curve's own."""
+    knots = clamped_knots(interior, 3)
+    every = np.unique(np.r_[knots, curve.knots])
+    s = (every[:-1, None] + np.diff(every)[:, None] * np.linspace(0, 1, 6)).ravel()
+    s[[0, -1]] = 0.0, 1.0
+    samples = Samples.at(knots, s)
+    weight = np.ones(len(s))
+    weight[[0, -1]] = 1e6
+    points = evaluate(curve, s)
+    count = len(knots) - 4
+    information = weight[:, None, None] * np.eye(3)
+    columns = []
+    for block in np.split(points, range(3, points.shape[1], 3), axis=1):
+        band, right = np.zeros((3 * count, spline.BANDWIDTH)), np.zeros(3 * count)
+        padded = np.zeros((len(s), 3))
+        padded[:, : block.shape[1]] = block
+        spline.add_rows(
+            samples.first,
+            samples.table[0],
+            information,
+            weight[:, None] * padded,
+            band,
+            right,
+        )
+        band[:, 0] += 1e-9
+        spline.factorize(band)
+        columns.append(spline.solve_factorized(band, right).reshape(-1, 3)[:, : block.shape[1]])
+    return curve_from(3, knots, np.hstack(columns))
+
+
+def _spans(curve: Nurbs, rig: StereoRig) -> tuple[Float64, Float64]:
+    """Length of each span, and the length that its bend asks for, px."""
+    samples = Samples.of(curve.knots, 3)
+    points, first, second = (samples.values(curve.control_points, d) for d in range(3))
+    both = views(rig, points, first)
+    speed = np.maximum(sum(view.speed for view in both) / 2, 1e-9)
+    width = (speed * samples.share).reshape(-1, 3).sum(axis=1)
+    curvature = np.max([_curvature(view, second) for view in both], axis=0)
+    sharpest = curvature.reshape(-1, 3).max(axis=1)
+    wanted = np.clip((384 * _TOLERANCE_PX / np.maximum(sharpest, 1e-6) ** 3) ** 0.25, *_SPACING_PX)
+    return width, np.maximum(wanted, width.sum() / _MOST)
+
+
+def _curvature(view: View, second: Float64) -> Float64:
+    """(k,) of the image curve, 1/px; the depth, which is noisier, has no say in it."""
+    across = (view.normals[:, None, :] @ view.jacobian @ second[:, :, None])[:, 0, 0]
+    return np.abs(across) / np.maximum(view.speed, 1e-9) ** 2
+
+
+def _crowded(width: Float64, wanted: Float64) -> list[int]:
+    """Interior knots to remove, never two neighbours at once."""
+    chosen: list[int] = []
+    for i in range(len(width) - 1):
+        merged, needed = width[i] + width[i + 1], min(wanted[i], wanted[i + 1])
+        if merged < _CROWDED * needed and (not chosen or chosen[-1] < i - 1):
+            chosen.append(i)
+    return chosen
+
+
+def _spatial(curve: Nurbs) -> Nurbs:
+    return curve_from(3, curve.knots, curve.control_points[:, :3])

@@ -1,0 +1,106 @@
+"""Where the thread ends: the step of the ridge response along the curve and beyond it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.kernels import search
+from suturetrack.nurbs import derivative, evaluate
+from suturetrack.tracking.sampling import views
+from suturetrack.types import Float64, Nurbs, RidgeField
+
+_STEP_PX = 0.5
+_INWARD_PX, _OUTWARD_PX = 40.0, 10.0
+_HALF = 0.5
+# What is shorter than this is a speck behind the end and not its continuation.
+_SOLID_PX = 8.0
+
+
+@dataclass(frozen=True)
+class EndStep:
+    """What the images show at one end."""
+
+    offset_px: float
+    """How far beyond the curve's end the thread ends, px along the curve; negative: before it."""
+    offset: float
+    """The same as a part of the curve's length."""
+    at_border: bool
+    """Whether the image's border cuts the thread."""
+
+
+def find_end(
+    curve: Nurbs,
+    end: int,
+    field: RidgeField,
+    rig: StereoRig,
+    levels: tuple[float, float],
+) -> EndStep | None:
+    """Looks for the step of the response at the end `end` (0 or 1), in both images at once.
+
+    None where there is no thread near the end.
+    """
+    scale = _px_per_s(curve, end, rig)
+    x = np.arange(-min(_INWARD_PX, 0.5 * scale), _OUTWARD_PX + 0.1, _STEP_PX)
+    points, derivatives = _extension(curve, end, np.asarray(x / scale, np.float64))
+    both = views(rig, points, derivatives)
+    responses = [
+        np.minimum(search.responses(image, view.pixels, view.tangents) / level, 1.2)
+        for image, view, level in zip((field.left, field.right), both, levels, strict=True)
+    ]
+    inside = both[0].inside(rig.image_size) & both[1].inside(rig.image_size)
+    if not inside.any():
+        return None
+    x, mean, least = (
+        x[inside],
+        _smooth(np.mean(responses, axis=0)[inside]),
+        np.min(responses, axis=0)[inside],
+    )
+    boundary = _outer_boundary(x, mean, np.minimum(_smooth(least) + 0.15, mean))
+    if boundary is None:
+        return None
+    at_border = not inside.all() and boundary > x[-1] - 3
+    return EndStep(boundary, boundary / scale, at_border)
+
+
+def _smooth(profile: Float64) -> Float64:
+    padded = np.pad(profile, 2, mode="edge")
+    return np.convolve(padded, np.full(5, 0.2), mode="valid")
+
+
+def _outer_boundary(x: Float64, mean: Float64, least: Float64) -> float | None:
+    """Where the outermost solid run that begins on the curve ends, to a part of a pixel."""
+    above = (mean > _HALF) & ((x <= 0) | (least > _HALF))
+    above = search.solid(above, np.full(len(x), _STEP_PX), _SOLID_PX)
+    starts = np.flatnonzero(above & ~np.r_[False, above[:-1]])
+    starts = starts[x[starts] <= 0]
+    if not len(starts):
+        return None
+    last = int(starts[-1])
+    while last + 1 < len(x) and above[last + 1]:
+        last += 1
+    if last + 1 == len(x):
+        return float(x[-1])
+    share = (mean[last] - _HALF) / max(float(mean[last] - mean[last + 1]), 1e-6)
+    return float(x[last] + _STEP_PX * min(max(share, 0.0), 1.0))
+
+
+def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:
+    s = np.array([0.02, 0.0]) if end == 0 else np.array([0.98, 1.0])
+    both = views(rig, evaluate(curve, s), derivative(curve, s))
+    return max(float(np.mean([view.speed.mean() for view in both])), 1e-6)
+
+
+def _extension(curve: Nurbs, end: int, beyond: Float64) -> tuple[Float64, Float64]:
+    """Points and derivatives at `beyond` past the end: the curve itself, then a parabola."""
+    sign = 1.0 if end else -1.0
+    inner = float(end) + sign * np.minimum(beyond, 0.0)
+    outer = np.maximum(beyond, 0.0)[:, None]
+    points, first = evaluate(curve, inner), derivative(curve, inner)
+    bend = derivative(curve, float(end) - sign * np.linspace(0, 0.04, 5), 2).mean(axis=0)
+    tip = derivative(curve, np.array([float(end)]))
+    points = points + outer * sign * tip + outer**2 / 2 * bend
+    first = np.where(outer > 0, tip + sign * outer * bend, first)
+    return points, first

@@ -1,0 +1,49 @@
+"""The energies of the paper, for either method."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.kernels import search
+from suturetrack.tracking.sampling import Samples, View, views
+from suturetrack.types import Energies, Float32, Float64, Nurbs, RidgeField
+
+
+def energies(
+    curve: Nurbs, field: RidgeField, rig: StereoRig, cutoffs: tuple[float, float]
+) -> Energies:
+    """Eqs. (4) and (7) of the curve in the field, and its bending.
+
+    Args:
+        cutoffs: |V_c| of eq. (7), left and right.
+    """
+    samples = Samples.of(curve.knots, 5)
+    points, first, second = (samples.values(curve.control_points, d) for d in range(3))
+    images = [
+        -float(np.sum(samples.share * search.responses(image, view.pixels, view.tangents)))
+        for image, view in zip((field.left, field.right), views(rig, points, first), strict=True)
+    ]
+    return Energies(
+        images[0], images[1], _end(curve, field, rig, cutoffs), _bending(first, second, samples)
+    )
+
+
+def _end(curve: Nurbs, field: RidgeField, rig: StereoRig, cutoffs: tuple[float, float]) -> float:
+    ends = Samples.at(curve.knots, np.array([0.0, 1.0]))
+    both = views(rig, ends.values(curve.control_points), ends.values(curve.control_points, 1))
+    return sum(
+        float(np.sum((_response(image, view) - cutoff) ** 2))
+        for image, view, cutoff in zip((field.left, field.right), both, cutoffs, strict=True)
+    )
+
+
+def _response(image: Float32, view: View) -> Float64:
+    return search.responses(image, view.pixels, view.tangents)
+
+
+def _bending(first: Float64, second: Float64, samples: Samples) -> float:
+    speed = np.maximum(np.linalg.norm(first, axis=1), np.finfo(float).tiny)
+    curvature = np.linalg.norm(np.cross(first, second), axis=1) / speed**3
+    length = float(np.sum(speed * samples.share))
+    return length * float(np.sum(curvature**2 * speed * samples.share))

@@ -1,0 +1,281 @@
+"""The default method: banded Gauss-Newton over the control points on stereo normal offsets.
+
+Each sample of the curve is looked for along its normal in both images. The offsets found are rows in
+the step of the control points, beside rows for the prediction, the stretch and the bending. Rows
+count by the length of image curve that they stand for, so sampling and knots may change freely.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.kernels import search, spline
+from suturetrack.nurbs import curve_from
+from suturetrack.tracking.config import TrackingConfig
+from suturetrack.tracking.sampling import Samples, View, views
+from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField
+
+_STEP_PX = 0.5
+# Offsets measured closer than this along the thread share their noise: the filter smears it.
+_CORRELATION_PX = 4.0
+_PEAK_HALF_PX = 1.5
+_ROUGHNESS = 0.1
+_LEAST_RESPONSE = 0.35
+_REFINED_PX = 3.0
+# A shorter run of samples that look like thread is chance.
+_SHORTEST_RUN_PX = 10.0
+_OUTLIER_PX = 0.5
+_EVEN = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """What the search found beside the samples in one image."""
+
+    offset: Float64
+    """(k,) px along the normal, 0 where nothing was found."""
+    response: Float64
+    """(k,) of eq. (4) at the place found."""
+    found: Bool
+    """(k,)"""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A curve fitted to one field."""
+
+    curve: Nurbs
+    samples: Samples
+    offsets: tuple[Offsets, Offsets]
+    """Of the last iteration, before its step."""
+    residual: Float64
+    """(k, 2) px between the curve and what was found, left and right; nan where nothing was."""
+    covariance: Float64
+    """(k, 3, 3) of the samples' positions."""
+    gain: Float64
+    """(n + 1, 3, 3) how far the images, and not the prediction, placed each control point."""
+
+
+def search_normals(
+    image: Float32,
+    view: View,
+    share: Float64,
+    level: float,
+    reach_px: float,
+    size: tuple[int, int],
+) -> Offsets:
+    """Looks for the thread along the normals of the samples, as one continuous line."""
+    half = round(reach_px / _STEP_PX)
+    grid = _STEP_PX * np.arange(-half, half + 1)
+    profiles = search.normal_profiles(image, view.pixels, view.tangents, grid)
+    gain = np.minimum(profiles / level, 1.0) - 0.1 * (grid / reach_px) ** 2
+    path = search.best_path(gain, _ROUGHNESS * _STEP_PX**2, 4)
+    position, response = search.peaks(profiles, path, round(_PEAK_HALF_PX / _STEP_PX))
+    offset = (position - half) * _STEP_PX
+    found = np.isfinite(position) & (response > _LEAST_RESPONSE * level) & view.inside(size)
+    found = search.solid(found, view.speed * share, _SHORTEST_RUN_PX)
+    return Offsets(np.where(found, offset, 0.0), response, found)
+
+
+def fit(
+    predicted: Nurbs,
+    field: RidgeField,
+    rig: StereoRig,
+    levels: tuple[float, float],
+    reach_px: float,
+    config: TrackingConfig,
+) -> Fit:
+    """Moves the predicted curve onto the field.
+
+    Args:
+        predicted: cubic, parametrised like its arc length.
+        levels: response of a clear view of the thread, left and right.
+        reach_px: how far along the normals the thread is looked for at first.
+    """
+    samples = Samples.of(predicted.knots, config.samples_per_span)
+    reference = _Reference.of(samples, predicted)
+    control_points = predicted.control_points
+    for iteration in range(config.iterations):
+        reach = reach_px if iteration == 0 else min(reach_px, _REFINED_PX)
+        linear = _Linearized(samples, control_points, field, rig, levels, reach)
+        equations = linear.equations(reference, levels, config, robust=iteration > 0)
+        control_points = control_points + equations.solve()
+    curve = curve_from(spline.DEGREE, predicted.knots, control_points)
+    residual = _residual(rig.project(samples.values(control_points)), linear)
+    return Fit(curve, samples, linear.offsets, residual, *equations.outcome(samples))
+
+
+def observe(
+    curve: Nurbs,
+    field: RidgeField,
+    rig: StereoRig,
+    levels: tuple[float, float],
+    config: TrackingConfig,
+) -> Fit:
+    """What the field says about a curve that something else has fitted."""
+    samples = Samples.of(curve.knots, config.samples_per_span)
+    linear = _Linearized(samples, curve.control_points, field, rig, levels, _REFINED_PX)
+    equations = linear.equations(_Reference.of(samples, curve), levels, config, robust=True)
+    equations.solve()
+    residual = _residual([view.pixels for view in linear.views], linear)
+    return Fit(curve, samples, linear.offsets, residual, *equations.outcome(samples))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reference:
+    """What the curve should stay like where the images do not tell."""
+
+    points: Float64
+    """(k, 3) predicted samples."""
+    speed: float
+    """Length of the curve: |df/ds| everywhere."""
+
+    @classmethod
+    def of(cls, samples: Samples, curve: Nurbs) -> _Reference:
+        local = _norm(samples.values(curve.control_points, 1))
+        return cls(samples.values(curve.control_points), float(np.sum(samples.share * local)))
+
+
+class _Linearized:
+    """The curve of one iteration in both images, and what was found beside it."""
+
+    def __init__(
+        self,
+        samples: Samples,
+        control_points: Float64,
+        field: RidgeField,
+        rig: StereoRig,
+        levels: tuple[float, float],
+        reach_px: float,
+    ) -> None:
+        self.samples = samples
+        self.points, self.first, self.second = (
+            samples.values(control_points, times) for times in range(3)
+        )
+        self.views = views(rig, self.points, self.first)
+        left, right = (
+            search_normals(image, view, samples.share, level, reach_px, rig.image_size)
+            for image, view, level in zip(
+                (field.left, field.right), self.views, levels, strict=True
+            )
+        )
+        self.offsets = left, right
+
+    def equations(
+        self,
+        reference: _Reference,
+        levels: tuple[float, float],
+        config: TrackingConfig,
+        robust: bool,
+    ) -> _Equations:
+        """The normal equations of the next step."""
+        equations = _Equations(int(self.samples.first[-1]) + spline.ORDER)
+        self._add_prediction(equations, reference, config)
+        self._add_shape(equations, reference, config)
+        equations.blind = equations.band.copy()
+        for view, found, level in zip(self.views, self.offsets, levels, strict=True):
+            weight = self._amount(view) / config.noise_px**2
+            weight = weight * found.found * np.clip(found.response / level, 0, 1) ** 2
+            if robust:
+                weight = weight / (1 + (found.offset / _OUTLIER_PX) ** 2) ** 2
+            row = (view.normals[:, None, :] @ view.jacobian)[:, 0, :]
+            equations.add_scalar(self.samples, 0, row, weight, found.offset)
+        return equations
+
+    def _add_prediction(
+        self, equations: _Equations, reference: _Reference, config: TrackingConfig
+    ) -> None:
+        """The drift is one of pixels, so that the past holds depth no tighter than the images do."""
+        weight = self._amount(self.views[0]) / config.drift_px**2 / 2
+        away = (reference.points - self.points)[:, :, None]
+        for view in self.views:
+            information = weight[:, None, None] * (view.jacobian.transpose(0, 2, 1) @ view.jacobian)
+            equations.add(self.samples, 0, information, (information @ away)[:, :, 0])
+
+    def _add_shape(
+        self, equations: _Equations, reference: _Reference, config: TrackingConfig
+    ) -> None:
+        """Little bending, and an even speed along the curve: f'' across and along the tangent.
+
+        No length is asked for: noise in depth only ever adds to the length, and a goal taken from
+        the curve itself would keep what it adds.
+        """
+        """Little bending, and an even speed along the curve: f'' across and along the tangent.
+
+        No length is asked for: noise in depth only ever adds to the length, and a goal taken from
+        the curve itself would keep what it adds.
+        """
+        speed = reference.speed
+        tangent = self.first / _norm(self.first)[:, None]
+        along = tangent[:, :, None] * tangent[:, None, :]
+        bending = config.smoothing * self._pixel * self.samples.share / speed**3
+        stretch = self._amount(self.views[0]) / (config.stretch * speed) ** 2 / _EVEN**2
+        information = bending[:, None, None] * np.eye(3) + stretch[:, None, None] * along
+        pull = -(information @ self.second[:, :, None])[:, :, 0]
+        equations.add(self.samples, 2, information, pull)
+
+    def _amount(self, view: View) -> Float64:
+        """(k,) how many independent measurements each sample stands for."""
+        return view.speed * self.samples.share / _CORRELATION_PX
+
+    @property
+    def _pixel(self) -> Float64:
+        """(k,) length of a pixel at each sample's depth."""
+        return 1 / np.maximum(np.linalg.norm(self.views[0].jacobian[:, 1], axis=1), 1e-12)
+
+
+class _Equations:
+    """Normal equations of one step of the control points."""
+
+    def __init__(self, count: int) -> None:
+        self.band = np.zeros((3 * count, spline.BANDWIDTH))
+        self.gradient = np.zeros(3 * count)
+        self.blind = self.band
+        """The band as it would be without images."""
+
+    def add_scalar(
+        self, samples: Samples, times: int, row: Float64, weight: Float64, goal: Float64
+    ) -> None:
+        """Rows row . d = goal, d the change of the samples or of a derivative."""
+        weighted = weight[:, None] * row
+        self.add(samples, times, weighted[:, :, None] * row[:, None, :], weighted * goal[:, None])
+
+    def add_point(self, samples: Samples, times: int, weight: Float64, goal: Float64) -> None:
+        """Rows d = goal, in all three coordinates."""
+        self.add(samples, times, weight[:, None, None] * np.eye(3), weight[:, None] * goal)
+
+    def solve(self) -> Float64:
+        """(n + 1, 3) step; leaves the factor in the band."""
+        spline.factorize(self.band)
+        return spline.solve_factorized(self.band, self.gradient).reshape(-1, 3)
+
+    def outcome(self, samples: Samples) -> tuple[Float64, Float64]:
+        """After `solve`: covariance of the samples, and gain of the control points."""
+        inverse = spline.band_of_inverse(self.band)
+        spline.factorize(self.blind)
+        blind = spline.diagonal_blocks(spline.band_of_inverse(self.blind))
+        kept = np.linalg.solve(blind, spline.diagonal_blocks(inverse))
+        covariance = spline.sample_covariance(samples.first, samples.table[0], inverse)
+        return covariance, np.eye(3) - kept.transpose(0, 2, 1)
+
+    def add(self, samples: Samples, times: int, information: Float64, pull: Float64) -> None:
+        spline.add_rows(
+            samples.first, samples.table[times], information, pull, self.band, self.gradient
+        )
+
+
+def _norm(vectors: Float64) -> Float64:
+    return np.maximum(np.linalg.norm(vectors, axis=1), np.finfo(float).tiny)
+
+
+def _residual(pixels: Sequence[Float64], linear: _Linearized) -> Float64:
+    """(k, 2) what is left of the offsets once the samples have moved to `pixels`."""
+    columns = []
+    for moved, view, found in zip(pixels, linear.views, linear.offsets, strict=True):
+        gone = np.sum((moved - view.pixels) * view.normals, axis=1)
+        columns.append(np.where(found.found, found.offset - gone, np.nan))
+    return np.stack(columns, axis=1)

@@ -1,0 +1,93 @@
+"""A curve's samples: their basis once, their points and image tangents as the curve moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.kernels import spline
+from suturetrack.types import Bool, Float64, Nurbs
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Where a cubic curve is looked at: parameters and the basis there."""
+
+    s: Float64
+    """(k,) sorted parameters."""
+    share: Float64
+    """(k,) length of the piece of [0, 1] that each stands for."""
+    first: spline.Int64
+    """(k,) first of the four control points that move the sample."""
+    table: Float64
+    """(3, k, 4) basis values, first and second derivatives."""
+
+    @classmethod
+    def of(cls, knots: Float64, per_span: int) -> Samples:
+        """`per_span` samples in each knot span, evenly, clear of the knots."""
+        edges = np.unique(knots)
+        width = np.diff(edges)[:, None] / per_span
+        s = (edges[:-1, None] + width * (np.arange(per_span) + 0.5)).ravel()
+        return cls(s, np.repeat(width, per_span), *spline.local_basis(s, knots))
+
+    @classmethod
+    def at(cls, knots: Float64, s: Float64) -> Samples:
+        """The given sorted parameters."""
+        return cls(s, np.gradient(s), *spline.local_basis(s, knots))
+
+    def values(self, control_points: Float64, times: int = 0) -> Float64:
+        """(k, dim) points, or derivatives, for (n + 1, dim) control points."""
+        return spline.combine(self.first, self.table[times], control_points)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The samples in one image."""
+
+    pixels: Float64
+    """(k, 2) rectified px."""
+    tangents: Float64
+    """(k, 2) unit tangents."""
+    speed: Float64
+    """(k,) px of the image curve per unit of s."""
+    jacobian: Float64
+    """(k, 2, 3) derivative of the pixel."""
+
+    @property
+    def normals(self) -> Float64:
+        """(k, 2) unit normals, the tangents turned by +90 degrees."""
+        return np.stack([-self.tangents[:, 1], self.tangents[:, 0]], axis=1)
+
+    def inside(self, image_size: tuple[int, int], margin: float = 1.0) -> Bool:
+        """(k,) whether the samples lie inside the image."""
+        u, v = self.pixels.T
+        width, height = image_size
+        return (
+            (u >= margin) & (v >= margin) & (u <= width - 1 - margin) & (v <= height - 1 - margin)
+        )
+
+
+def views(rig: StereoRig, points: Float64, derivatives: Float64) -> tuple[View, View]:
+    """Both images of (k, 3) points with their derivatives by s."""
+    left, right = (
+        _view(pixels, jacobian, derivatives)
+        for pixels, jacobian in zip(
+            rig.project(points), rig.projection_jacobian(points), strict=True
+        )
+    )
+    return left, right
+
+
+def _view(pixels: Float64, jacobian: Float64, derivatives: Float64) -> View:
+    along = (jacobian @ derivatives[:, :, None])[:, :, 0]
+    speed = np.hypot(along[:, 0], along[:, 1])
+    return View(pixels, along / np.maximum(speed, 1e-9)[:, None], speed, jacobian)
+
+
+def unit_weights(curve: Nurbs) -> Nurbs:
+    """The cubic curve itself; others are refused."""
+    if curve.degree != spline.DEGREE or np.any(curve.weights != 1):
+        raise ValueError("tracking takes cubic curves with unit weights")
+    return curve

@@ -1,0 +1,112 @@
+"""Holds the threads of one rig."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.initialization import (
+    Initialization,
+    InitializationConfig,
+    InitializationError,
+    initialize,
+)
+from suturetrack.tracking.config import TrackingConfig
+from suturetrack.tracking.follower import RELIABILITY_SAMPLES, Follower
+from suturetrack.types import Energies, RidgeField, Seed, Stamp, Status, ThreadState
+
+_NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerStep:
+    """What one field gave."""
+
+    states: tuple[ThreadState, ...]
+    """One for each seeded thread, in the order of the seeds."""
+    initializations: dict[str, Initialization | InitializationError]
+    """By thread: what came of looking for it from its seed in this field."""
+
+
+@dataclass
+class _Thread:
+    seed: Seed
+    attempts: int
+    follower: Follower | None = None
+    last: ThreadState | None = None
+
+
+class Tracker:
+    """Finds seeded threads and follows them from field to field."""
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        config: TrackingConfig = TrackingConfig(),
+        initialization: InitializationConfig = InitializationConfig(),
+    ) -> None:
+        self._rig, self._config, self._initialization = rig, config, initialization
+        self._threads: dict[str, _Thread] = {}
+
+    def seed(self, seed: Seed) -> None:
+        """Looks for the thread from the next field on, for up to `config.patience` fields.
+
+        A thread of the same name is looked for anew.
+        """
+        self._threads[seed.thread] = _Thread(seed, self._config.patience)
+
+    def forget(self, thread: str) -> None:
+        """Drops the thread; unknown names are ignored."""
+        self._threads.pop(thread, None)
+
+    def step(self, field: RidgeField) -> TrackerStep:
+        """The seeded threads in the next field.
+
+        A field that is not newer than the last one changes nothing: its states are the last ones.
+        """
+        initializations: dict[str, Initialization | InitializationError] = {}
+        states = []
+        for name, thread in self._threads.items():
+            if thread.follower is None:
+                state = self._find(name, thread, field, initializations)
+            else:
+                state = thread.follower.step(field, name)
+            thread.last = state
+            states.append(state)
+        return TrackerStep(tuple(states), initializations)
+
+    def _find(
+        self,
+        name: str,
+        thread: _Thread,
+        field: RidgeField,
+        initializations: dict[str, Initialization | InitializationError],
+    ) -> ThreadState:
+        if thread.attempts <= 0:
+            return _not_found(name, field.stamp, ())
+        thread.attempts -= 1
+        try:
+            found = initialize(field, self._rig, thread.seed, self._initialization)
+        except InitializationError as error:
+            initializations[name] = error
+            return _not_found(name, field.stamp, (f"not found: {error.reason}",))
+        initializations[name] = found
+        thread.follower = Follower(found.curve, field, self._rig, self._config)
+        state = thread.follower.step(field, name)
+        return replace(state, events=("found", *state.events))
+
+
+def _not_found(name: str, stamp: Stamp, events: tuple[str, ...]) -> ThreadState:
+    return ThreadState(
+        stamp=stamp,
+        thread=name,
+        status=Status.LOST,
+        curve=None,
+        length=float("nan"),
+        energies=Energies(),
+        sigma=_NOWHERE,
+        seen=np.zeros(RELIABILITY_SAMPLES, bool),
+        events=events,
+    )
