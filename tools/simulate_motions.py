@@ -290,7 +290,9 @@ def pull_through() -> Result:
     """One end on the stage at 9.7 mm/s, the other comes out of a hole in the table."""
     outside, inside, link = 60.0, 110.0, 2.5
     s = np.arange(0, inside + outside + link / 2, link)
-    rest = np.c_[np.zeros(len(s)), np.zeros(len(s)), s - inside]
+    kink = 0.35 * np.sin(2 * np.pi * s / 38) + 0.25 * np.sin(2 * np.pi * s / 61)
+    links = link * np.c_[np.sin(kink), np.zeros(len(s)), np.cos(kink)]
+    rest = np.r_[np.zeros((1, 3)), np.cumsum(links[:-1], axis=0)] - [0, 0, inside]
     turn = np.clip((s - inside + 6.0) / 12.0, 0, 1) * np.pi / 2
     heading = 0.7 * np.sin(2 * np.pi * np.maximum(s - inside, 0) / 45)
     step = np.c_[np.sin(turn) * np.cos(heading), np.sin(turn) * np.sin(heading), np.cos(turn)]
@@ -308,13 +310,13 @@ def pull_through() -> Result:
     )
     held = {len(s) - 1: along(winding(start[-1]), 9.7)}
     thread = Thread(rest, held, start, bending_length=25.0)
-    return Result(simulate([thread], seconds=21, table=table, friction=0.2))
+    return Result(simulate([thread], seconds=21, table=table, friction=0.9))
 
 
 def winding(origin: Array) -> Array:
     """(n, 3) a way from `origin` that swings to and fro while it leads away."""
     phase = np.linspace(0, 1, 2000)
-    swing = 24 * np.sin(2 * np.pi * 1.75 * phase) * np.minimum(phase * 4, 1)
+    swing = 20 * np.sin(2 * np.pi * 2.25 * phase) * np.minimum(phase * 4, 1)
     return origin + np.c_[18 * phase, swing, np.zeros(len(phase))]
 
 

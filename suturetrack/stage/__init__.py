@@ -5,5 +5,15 @@ from suturetrack.stage.background import TEXTURES
 from suturetrack.stage.cameras import RIGS
 from suturetrack.stage.scenarios import SCENARIOS
 from suturetrack.stage.scene import Scene, open_scene
+from suturetrack.stage.sheet import contact_sheet
 
-__all__ = ["COLOURS", "RIGS", "SCENARIOS", "TEXTURES", "Picture", "Scene", "open_scene"]
+__all__ = [
+    "COLOURS",
+    "RIGS",
+    "SCENARIOS",
+    "TEXTURES",
+    "Picture",
+    "Scene",
+    "contact_sheet",
+    "open_scene",
+]

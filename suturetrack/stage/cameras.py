@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from suturetrack.camera import StereoRig
-from suturetrack.types import Float64, InputError
+from suturetrack.types import Bool, Float64, InputError
 
 
 @dataclass(frozen=True)
@@ -91,20 +91,25 @@ def choose_viewpoint(
 ) -> Viewpoint:
     """A random view of (N, 3) points of the table that keeps them `margin` inside both images.
 
-    `margin` is a share of the image's height. Where no roll fits, the camera looks from the largest
-    distance and straight down, and some points may be out of view.
+    `margin` is a share of the image's height. Where no view holds them all, the one that holds most
+    is taken.
     """
     tilt, axis = _LARGEST_TILT * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
     roll, near = rng.uniform(0, 2 * np.pi), rng.uniform()
     centre = (points.max(0) + points.min(0)) / 2
     signs = np.where(np.arange(len(_ROLLS)) % 2, 1, -1)
+    best: tuple[float, Viewpoint] | None = None
     for share in (1.0, 0.5, 0.0):
         for distance in np.linspace(distances[0] + near * np.ptp(distances), distances[1], 3):
             for step in signs * _ROLLS:
                 view = _look_at(centre, rig, float(distance), (axis, share * tilt, roll + step))
-                if _inside(rig, view.to_camera(points), margin):
+                held = float(_inside(rig, view.to_camera(points), margin).mean())
+                if best is None or held > best[0]:
+                    best = held, view
+                if held == 1.0:
                     return view
-    return view
+    assert best is not None
+    return best[1]
 
 
 def push_out(
@@ -117,7 +122,7 @@ def push_out(
     step, last = np.r_[step / np.linalg.norm(step), 0.0], view
     for shift in np.arange(0.0, 200.0, 0.5):
         moved = Viewpoint(view.rotation, view.translation + shift * step)
-        if not _inside(rig, moved.to_camera(rest), margin):
+        if not _inside(rig, moved.to_camera(rest), margin).all():
             break
         last = moved
     return last
@@ -133,9 +138,9 @@ def _look_at(
     return Viewpoint(rotation, np.array([rig.baseline / 2, 0.0, distance]) - rotation @ centre)
 
 
-def _inside(rig: StereoRig, points: Float64, margin: float) -> bool:
+def _inside(rig: StereoRig, points: Float64, margin: float) -> Bool:
+    """(N,) whether (N, 3) points are that share of the height inside both images."""
     size = np.array(rig.image_size)
     border = margin * size[1]
-    return all(
-        bool(np.all((view > border) & (view < size - 1 - border))) for view in rig.project(points)
-    )
+    inside = [(view > border) & (view < size - 1 - border) for view in rig.project(points)]
+    return np.asarray((inside[0] & inside[1]).all(axis=1))

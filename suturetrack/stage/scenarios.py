@@ -79,7 +79,6 @@ SCENARIOS = {
         motions=("grasped",),
         threads=(ThreadModel(130),),
         starts_at_rest=True,
-        top_speed=110.0,
     ),
     "clutter": Scenario(
         "veins and other threads run on past an end and cross at shallow angles; bright spots",
@@ -87,6 +86,14 @@ SCENARIOS = {
         threads=_MEDIUM,
         backgrounds=("tissue",),
         clutter=True,
+    ),
+    "two-threads": Scenario(
+        "two threads of different colours that cross",
+        motions=("two-threads",),
+        threads=(
+            ThreadModel(120, colours=("violet", "black")),
+            ThreadModel(120, colours=("blue", "undyed")),
+        ),
     ),
     "fast": Scenario(
         "one end is shaken at up to 200 mm/s: motion blur, tens of pixels a frame",

@@ -23,7 +23,7 @@ from suturetrack.stage.scenarios import SCENARIOS, Scenario
 from suturetrack.types import Bool, Float32, Float64, Image, InputError, Stamp, Truth
 
 DEFAULT_PICTURE = Picture()
-_SAMPLES_PER_PX = 0.8
+_SAMPLES_PER_PX = 0.6
 _MARGIN = 0.05
 _HOLE_RADIUS = 0.9
 _MOST_EXPOSURES = 12
@@ -102,7 +102,7 @@ class Scene:
         self.rig, self.fps, self._real_rig = rig, fps, real_rig
         self.frame_count = round(scenario.seconds * fps)
         self._seed, self._scenario = seed, scenario
-        self._play = Play(scenario, rng, _SAMPLES_PER_PX * rig.focal / distances[0])
+        self._play = Play(scenario, rng, _SAMPLES_PER_PX * rig.focal / distances[1])
         self.threads = self._play.threads
         self._view = self._choose_view(rng, distances)
         self._look = Look.draw(rng, picture)
