@@ -13,6 +13,9 @@ from dataclasses import dataclass
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 for _name in _ONE_THREAD:
     os.environ.setdefault(_name, "1")
+# What is wrong with a video is said once, by us.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import threading
@@ -10,6 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 _STOP_S = 5.0
+_STOPPED = (-signal.SIGTERM,)
+"""Statuses of a process that was stopped before it could say goodbye."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +91,14 @@ class Fleet:
             self.stop()
             raise
 
-    def ended(self) -> Child | None:
-        """A process that has ended: one that failed, if there is one."""
-        ended = [child for child in self._children if child.status is not None]
-        return next((child for child in ended if child.status != 0), ended[0] if ended else None)
+    def has_ended(self) -> bool:
+        """Whether any process has ended by itself."""
+        return any(child.status is not None for child in self._children)
+
+    def complaint(self) -> str | None:
+        """Why the run failed; None when every process ended as it should."""
+        failed = [child for child in self._children if child.status not in (None, 0, *_STOPPED)]
+        return failed[0].complaint() if failed else None
 
     def stop(self) -> None:
         """Stops all that still run."""

@@ -110,6 +110,8 @@ def _resolve(config: RunConfig, rig_name: str) -> tuple[RunConfig, StereoRig]:
     footage.close()
     if config.service.lockstep and footage.live:
         raise InputError("--lockstep needs recorded input; a camera does not wait")
+    if config.service.zenoh is not None:
+        load_config(config.service.zenoh)
     seeds = config.seed or footage.seeds
     for pixel in seeds:
         seed_pixel(Seed(pixel=pixel), rig)
@@ -182,18 +184,17 @@ def _watch(config: RunConfig, console: Console, stack: ExitStack) -> Monitor:
     monitor = Monitor(bus)
     fleet = Fleet(_launches(config), console.print)
     try:
-        ended = None
         with closing(_glances(monitor, console)) as glances:
             for _ in glances:
-                ended = fleet.ended()
-                if stop or ended:
+                if stop or fleet.has_ended():
                     break
     finally:
         fleet.stop()
         time.sleep(_LAST_WORDS_S)
         monitor.listen()
-    if ended is not None and ended.status != 0 and not stop:
-        raise InputError(ended.complaint())
+    complaint = fleet.complaint()
+    if complaint is not None and not stop:
+        raise InputError(complaint)
     return monitor
 
 

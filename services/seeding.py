@@ -21,6 +21,7 @@ class _Case:
     seed: Seed
     attempts: int
     request: Request[Seed, SeedReply] | None
+    reason: str = "no field came in which to look for the thread"
 
 
 class SeedDesk:
@@ -70,13 +71,22 @@ class SeedDesk:
             case.attempts -= 1
             if isinstance(result, Initialization):
                 _answer(case, self._found(thread, stamp, result))
-            elif case.attempts > 0:
-                continue
-            elif case.request is None:
-                raise InputError(f"seed {case.seed.pixel}: {result.reason}")
             else:
+                case.reason = result.reason
+                if case.attempts > 0:
+                    continue
+                if case.request is None:
+                    raise InputError(_failure(case))
                 _answer(case, self._not_found(thread, stamp, result))
             del self._cases[thread]
+
+    def close(self) -> None:
+        """Tells what has become of the seeds that are still open; raises InputError as `settle`."""
+        for thread, case in self._cases.items():
+            _answer(case, SeedReply(thread, False, f"the tracker ended; {case.reason}"))
+        given = [case for case in self._cases.values() if case.request is None]
+        if given:
+            raise InputError(_failure(given[0]))
 
     def _found(self, thread: str, stamp: Stamp, found: Initialization) -> SeedReply:
         metres = self._rig.metres_per_unit
@@ -94,3 +104,7 @@ class SeedDesk:
 def _answer(case: _Case, reply: SeedReply) -> None:
     if case.request is not None:
         case.request.answer(reply)
+
+
+def _failure(case: _Case) -> str:
+    return f"seed {case.seed.pixel}: {case.reason}"

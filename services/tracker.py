@@ -57,6 +57,7 @@ def run(service: Service, config: TrackerConfig) -> None:
         for thread, result in step.initializations.items():
             recorder.initialization(ridges.stamp, thread, result)
         desk.settle(ridges.stamp, step.initializations)
+    desk.close()
 
 
 def _warm_up(rig: StereoRig, config: TrackerConfig) -> None:
