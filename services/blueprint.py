@@ -11,7 +11,7 @@ from services.drawing.common import VIEWS, part
 from suturetrack.types import Float64
 
 PROCESSES = ("source", "segmenter", "tracker")
-_EYE = np.array([-1.1, -0.6, -0.3])
+_EYE = np.array([-0.75, -0.6, -0.75])
 """Where the eye of the view of space is from its target, in distances of the thread."""
 
 
@@ -41,7 +41,7 @@ def blueprint(threads: Sequence[str], target: Float64) -> rrb.Blueprint:
 def _scene(names: Sequence[str], target: Float64) -> rrb.Container:
     images = rrb.Horizontal(*(_view(view, "", "/curve") for view in VIEWS))
     # From the side, with the cameras at one edge and the thread at the other.
-    middle, distance = 0.7 * target, np.linalg.norm(target)
+    middle, distance = 0.75 * target, np.linalg.norm(target)
     eye = rrb.EyeControls3D(
         position=middle + distance * _EYE, look_target=middle, eye_up=(0, -1, 0)
     )

@@ -42,6 +42,7 @@ def _console() -> Console:
 
 def show(summary: RunSummary, console: Console) -> None:
     """Prints the tables of a run."""
+    console.print(f"[bold]{summary.name}[/] ({summary.about})", highlight=False)
     for problem in summary.problems:
         console.print(f"[yellow]{problem}[/]", highlight=False)
     console.print(_processes(summary.processes))
@@ -74,11 +75,19 @@ def _processes(processes: list[ProcessSummary]) -> Table:
 
 
 def _status(threads: list[ThreadSummary]) -> Table:
-    table = _table("Status (%)", "thread", "from frame", "frames", *Status, "losses")
+    table = _table(
+        "Status (% of the frames since the seed)",
+        "thread",
+        "from frame",
+        "frames",
+        *Status,
+        "skipped",
+        "losses",
+    )
     for t in threads:
         table.add_row(
             *(t.thread, str(t.first), str(t.frames)),
-            *(f"{100 * t.shares[s]:.1f}" for s in Status),
+            *(f"{100 * share:.1f}" for share in (*t.shares.values(), t.skipped_share)),
             str(len(t.losses)),
         )
     return table

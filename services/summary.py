@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
 
 import numpy as np
 
-from services.run_folder import RecordedState, RunFolder
-from suturetrack import nurbs
-from suturetrack.camera import StereoRig
-from suturetrack.metrics import curve_error
-from suturetrack.types import Float64, Status, Truth
+from services.course import Course, Loss, courses, losses
+from services.run_folder import RunFolder
+from suturetrack.types import Float64, Status
 
 WRONG_PX = 3.0
-"""A curve whose mean distance from the truth is larger is on no thread."""
-_SAMPLES = 300
+"""A curve whose mean distance from the truth is larger is not on the thread."""
+_ORDER = ("source", "segmenter", "tracker")
 
 
 @dataclass(frozen=True)
@@ -59,37 +55,55 @@ class ProcessSummary:
 
 
 @dataclass(frozen=True)
-class Loss:
-    """A thread was lost, and when it was found again."""
-
-    frame: int
-    recovered: int | None
-
-
-@dataclass(frozen=True)
 class ThreadSummary:
-    """One thread over the run; lengths and errors in mm."""
+    """One thread over the run; nan for what cannot be told."""
 
     thread: str
-    frames: int
     first: int
+    """The frame of the first state."""
+    frames: int
+    """Frames of the run from there on, with those that were skipped on the way."""
     shares: dict[Status, float]
-    """Share of the frames with each status."""
+    """Share of those frames with each status."""
+    skipped_share: float
+    """Share of those frames that never reached the tracker."""
     losses: list[Loss]
     length_mm: Spread
-    """Of the frames whose status is `tracking`."""
+    """Of the frames called `tracking`."""
     true_length_mm: float
-    """Mean of the true length; nan without a truth."""
+    """Its mean over the same frames."""
     control_points: Spread
     energies: dict[str, Spread]
+    """Of the frames that are not lost, as the errors."""
     error_mm: Spread
-    """Mean distance of curve and truth, by frame, where not lost; nan without a truth."""
     error_px: Spread
-    """The same in pixels at the thread's depth."""
     wrong_share: float
-    """Share of the frames called `tracking` whose curve is more than `WRONG_PX` off; nan without."""
+    """Share of the frames called `tracking` whose curve is more than `WRONG_PX` off."""
     worst_frame: int | None
     """The frame of the largest error, else of the highest image energy."""
+
+    @classmethod
+    def of(cls, course: Course, last: int) -> ThreadSummary:
+        """Of a run whose last frame is `last`."""
+        first, held, tracking = int(course.frames[0]), course.held, course.tracking
+        frames, judged = last - first + 1, tracking & np.isfinite(course.error_px)
+        wrong = course.error_px[judged] > WRONG_PX
+        return cls(
+            thread=course.thread,
+            first=first,
+            frames=frames,
+            shares={s: float((course.status == s).sum() / frames) for s in Status},
+            skipped_share=1 - len(course.frames) / frames,
+            losses=losses(course.frames.tolist(), course.status.tolist()),
+            length_mm=Spread.of(course.length_mm[tracking]),
+            true_length_mm=Spread.of(course.true_length_mm[tracking]).mean,
+            control_points=Spread.of(course.control_points),
+            energies={name: Spread.of(e[held]) for name, e in course.energies.items()},
+            error_mm=Spread.of(course.error_mm[held]),
+            error_px=Spread.of(course.error_px[held]),
+            wrong_share=float(wrong.mean()) if len(wrong) else float("nan"),
+            worst_frame=None if course.worst is None else int(course.frames[course.worst]),
+        )
 
     @property
     def length_error_percent(self) -> float:
@@ -102,100 +116,36 @@ class RunSummary:
     """One run."""
 
     name: str
+    about: str
+    """Version, level and machine, in words."""
     processes: list[ProcessSummary]
     threads: list[ThreadSummary]
+    courses: list[Course]
     problems: list[str]
 
 
 def summarize(folder: RunFolder) -> RunSummary:
     """Reads what the figures need, and no image."""
-    rig = folder.rig()
-    truths = {(t.thread, t.stamp.frame): t for t in folder.truths()}
-    states = sorted(folder.states(), key=lambda s: s.state.thread)
-    threads = [
-        _thread(thread, list(group), truths, rig)
-        for thread, group in groupby(states, key=lambda s: s.state.thread)
-    ]
-    return RunSummary(folder.path.name, _processes(folder), threads, folder.problems)
-
-
-def errors_px(
-    states: Sequence[RecordedState], truths: dict[tuple[str, int], Truth], rig: StereoRig
-) -> tuple[Float64, Float64]:
-    """(n,) mean distances of each state's curve from the truth: in mm, and in px at its depth."""
-    mm, px = np.full((2, len(states)), np.nan)
-    s = np.linspace(0, 1, _SAMPLES)
-    for i, state in enumerate(recorded.state for recorded in states):
-        truth = truths.get((state.thread, state.stamp.frame))
-        if truth is None or state.curve is None:
-            continue
-        error = curve_error(nurbs.evaluate(state.curve, s), truth.points).mean
-        mm[i] = error * rig.metres_per_unit * 1000
-        px[i] = error * rig.focal / float(np.median(truth.points[:, 2]))
-    return mm, px
-
-
-def _thread(
-    thread: str,
-    states: list[RecordedState],
-    truths: dict[tuple[str, int], Truth],
-    rig: StereoRig,
-) -> ThreadSummary:
-    status = np.array([s.state.status for s in states])
-    held = (status != Status.LOST) & [s.state.curve is not None for s in states]
-    counts = Counter(status.tolist())
-    mm_per_unit = rig.metres_per_unit * 1000
-    length = np.array([s.state.length for s in states]) * mm_per_unit
-    truth = [truths.get((thread, s.state.stamp.frame)) for s in states]
-    true_length = Spread.of([t.length * mm_per_unit for t in truth if t is not None])
-    mm, px = errors_px(states, truths, rig)
-    tracking = (status == Status.TRACKING) & np.isfinite(px)
-    names = ("image_left", "image_right", "end", "internal")
-    energies = {n: np.array([getattr(s.state.energies, n) for s in states]) for n in names}
-    points = [len(s.state.curve.control_points) for s in states if s.state.curve is not None]
-    badness = np.where(held, px, np.nan)
-    if not np.isfinite(badness).any():
-        badness = np.where(held, energies["image_left"] + energies["image_right"], np.nan)
-    return ThreadSummary(
-        thread=thread,
-        frames=len(states),
-        first=states[0].state.stamp.frame,
-        shares={s: counts[s] / len(states) for s in Status},
-        losses=_losses(states),
-        length_mm=Spread.of(length[status == Status.TRACKING]),
-        true_length_mm=true_length.mean,
-        control_points=Spread.of(points),
-        energies={name: Spread.of(values[held]) for name, values in energies.items()},
-        error_mm=Spread.of(mm[held]),
-        error_px=Spread.of(px[held]),
-        wrong_share=float((px[tracking] > WRONG_PX).mean()) if tracking.any() else float("nan"),
-        worst_frame=(
-            states[int(np.nanargmax(badness))].state.stamp.frame
-            if np.isfinite(badness).any()
-            else None
-        ),
+    frames = folder.series("/plots/latency_ms/**").values()
+    last = int(max((numbers.max() for numbers, _ in frames), default=0))
+    found = courses(folder)
+    about = next(iter(folder.about().values()), {})
+    words = [f"suturetrack {about.get('suturetrack')}", about.get("level"), about.get("machine")]
+    return RunSummary(
+        name=folder.path.resolve().name,
+        about=", ".join(str(word) for word in words),
+        processes=_processes(folder),
+        threads=[ThreadSummary.of(course, last) for course in found],
+        courses=found,
+        problems=folder.problems,
     )
 
 
-def _losses(states: Sequence[RecordedState]) -> list[Loss]:
-    """Stretches of lost frames after the thread was found for the first time."""
-    found = [s.state for s in states if s.state.curve is not None]
-    losses: list[Loss] = []
-    for lost, stretch in groupby(found, key=lambda s: s.status is Status.LOST):
-        first = next(stretch).stamp.frame
-        if lost:
-            losses.append(Loss(first, None))
-        elif losses:
-            losses[-1] = Loss(losses[-1].frame, first)
-    return losses
-
-
 def _processes(folder: RunFolder) -> list[ProcessSummary]:
-    latencies = folder.series("/plots/latency_ms/**")
     clocks: dict[str, list[int]] = {}
     for row in folder.rows("/plots/latency_ms/**"):
         if "Scalars:scalars" in row:
-            clocks.setdefault(row["entity"].split("/")[-1], []).append(row["log_time"])
+            clocks.setdefault(row["entity"], []).append(row["log_time"])
     others = folder.series("/plots/dropped/**", "/plots/memory_mb/**")
 
     def largest(quantity: str, name: str) -> float:
@@ -203,14 +153,12 @@ def _processes(folder: RunFolder) -> list[ProcessSummary]:
         return float(values.max())
 
     summaries = []
-    for entity, (frames, values) in latencies.items():
-        name = entity.split("/")[-1]
-        seconds = (max(clocks[name]) - min(clocks[name])) / 1e9
-        rate = (len(frames) - 1) / seconds if seconds > 0 else float("nan")
-        dropped = int(largest("dropped", name))
-        memory = largest("memory_mb", name)
-        summaries.append(
-            ProcessSummary(name, len(frames), rate, Spread.of(values), dropped, memory)
-        )
-    order = ["source", "segmenter", "tracker"]
-    return sorted(summaries, key=lambda p: order.index(p.name) if p.name in order else len(order))
+    for entity, (_, latency_ms) in folder.series("/plots/latency_ms/**").items():
+        name, count = entity.split("/")[-1], len(latency_ms)
+        seconds = (max(clocks[entity]) - min(clocks[entity])) / 1e9
+        rate_hz = (count - 1) / seconds if seconds > 0 else float("nan")
+        dropped, memory_mb = int(largest("dropped", name)), largest("memory_mb", name)
+        spread = Spread.of(latency_ms)
+        summaries.append(ProcessSummary(name, count, rate_hz, spread, dropped, memory_mb))
+    known = {name: i for i, name in enumerate(_ORDER)}
+    return sorted(summaries, key=lambda p: known.get(p.name, len(known)))
