@@ -26,6 +26,7 @@ def blueprint(threads: Sequence[str], target: Float64) -> rrb.Blueprint:
             rrb.Horizontal(
                 _scene(names, target), _plots(names), column_shares=[7, 3], name="Tracking"
             ),
+            _curve(names),
             _segmentation(),
             rrb.Horizontal(
                 *(_view(view, "", "/growth/**") for view in VIEWS), name="Initialisation"
@@ -57,19 +58,34 @@ def _scene(names: Sequence[str], target: Float64) -> rrb.Container:
 
 
 def _plots(names: Sequence[str]) -> rrb.Container:
-    def of_threads(*quantities: str) -> list[str]:
-        return [f"/plots/{name}/{quantity}" for name in names for quantity in quantities]
-
     return rrb.Vertical(
-        rrb.StateTimelineView(origin="/plots", name="Status", contents=of_threads("status")),
+        rrb.StateTimelineView(origin="/plots", name="Status", contents=_each(names, "status")),
         _plot(
             "Energies of the images (best: -1) and of the ends",
-            *of_threads("energy/image", "energy/end"),
+            *_each(names, "energy/image", "energy/end"),
         ),
-        _plot("Length [mm]", *of_threads("length")),
+        _plot("Length [mm]", *_each(names, "length")),
         _plot("Latency [ms]", "/plots/latency_ms/**"),
         row_shares=[2, 5, 5, 4],
     )
+
+
+def _curve(names: Sequence[str]) -> rrb.Container:
+    parts = ("tangent", "reliability", "control_points")
+    contents = [f"/rig/thread/{name}/{part}" for name in names for part in parts]
+    return rrb.Horizontal(
+        rrb.Spatial3DView(origin="/rig", name="Tangents and reliability", contents=contents),
+        rrb.Vertical(
+            _plot("Bending (no unit)", *_each(names, "energy/internal")),
+            _plot("Control points", *_each(names, "control_points")),
+        ),
+        column_shares=[3, 2],
+        name="Curve",
+    )
+
+
+def _each(names: Sequence[str], *quantities: str) -> list[str]:
+    return [f"/plots/{name}/{quantity}" for name in names for quantity in quantities]
 
 
 def _segmentation() -> rrb.Container:

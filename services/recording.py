@@ -81,7 +81,7 @@ class Recorder:
         Raises:
             InputError: the file cannot be made.
         """
-        self._process, self._level, self._rig = process, level, rig
+        self.process, self._level, self._rig = process, level, rig
         self._config, self._flush_seconds, self._part_bytes = config, flush_seconds, part_bytes
         self._statuses: dict[str, Status | None] = {}
         self._target: Float64 | None = None
@@ -164,7 +164,7 @@ class Recorder:
         self._write(
             health.stamp,
             (
-                (f"/plots/{name}/{self._process}", rr.Scalars(getattr(health, name)))
+                (f"/plots/{name}/{self.process}", rr.Scalars(getattr(health, name)))
                 for name in quantities
             ),
         )
@@ -173,7 +173,7 @@ class Recorder:
         """Records a line of the process's log (DEBUG, INFO, WARN, ERROR), at the newest frame."""
         self._write(
             self._stamp,
-            [(f"/log/{self._process}", rr.TextLog(f"{self._process}: {text}", level=level))],
+            [(f"/log/{self.process}", rr.TextLog(f"{self.process}: {text}", level=level))],
         )
 
     def _flush_if_due(self) -> None:
@@ -226,7 +226,7 @@ class Recorder:
 
     def _latency(self, stamp: Stamp, published_ns: int | None) -> None:
         latency_ms = ((published_ns or time.time_ns()) - stamp.released_ns) / 1e6
-        self._write(stamp, [(f"/plots/latency_ms/{self._process}", rr.Scalars(latency_ms))])
+        self._write(stamp, [(f"/plots/latency_ms/{self.process}", rr.Scalars(latency_ms))])
 
     def _growth(
         self, thread: str, result: Initialization | InitializationError
@@ -261,17 +261,17 @@ class Recorder:
     def _open_part(self) -> None:
         """Directs the stream to the next free file; every part explains itself."""
         assert self._stream is not None
-        name, number = self._run_dir / f"{self._process}.rrd", 0
+        name, number = self._run_dir / f"{self.process}.rrd", 0
         while name.exists():
             number += 1
-            name = self._run_dir / f"{self._process}.{number}.rrd"
+            name = self._run_dir / f"{self.process}.{number}.rrd"
         self._path = name
         sink = rr.FileSink(str(name))
         self._stream.set_sinks(sink, default_blueprint=self._blueprint())
         self._stream.send_recording_name(self._run_dir.name)
         self._stream.reset_time()
         self._write_static(drawing.cameras(self._rig))
-        self._write_static(drawing.process_style(self._process))
+        self._write_static(drawing.process_style(self.process))
         self._write_static(self._about())
         for thread in self._statuses:
             self._write_static(drawing.thread_style(thread))
@@ -288,6 +288,6 @@ class Recorder:
         settings = {} if self._config is None else msgspec.to_builtins(self._config, enc_hook=str)
         text = msgspec.yaml.encode(settings).decode()
         return [
-            (f"/run/{self._process}", drawing.values("About", about)),
-            (f"/run/{self._process}/parameters", rr.TextDocument(text)),
+            (f"/run/{self.process}", drawing.values("About", about)),
+            (f"/run/{self.process}/parameters", rr.TextDocument(text)),
         ]
