@@ -14,18 +14,22 @@ from suturetrack.types import Float32, Float64
 # Texture pixels a mm, and pixels along its sides; its middle is the table's origin.
 _PER_MM = 8.0
 _SIZE = 2048
+# Width and depth of a vein along its way.
+_TAPER = (0.4, 0.7, 0.9, 1.0, 1.0, 0.9, 0.7, 0.4)
 
 
 def smooth_noise(
     rng: np.random.Generator, cells: int, octaves: int, falloff: float = 0.5
 ) -> Float32:
     """(S, S) noise with `cells` lumps along the side and finer ones on top; standard deviation 1."""
-    total = np.zeros((_SIZE, _SIZE), np.float32)
+    fine = min(4 * cells * 2 ** (octaves - 1), _SIZE)
+    total = np.zeros((fine, fine), np.float32)
     for octave in range(octaves):
-        grid = rng.standard_normal((cells * 2**octave,) * 2).astype(np.float32)
-        grid = cv2.resize(grid, (_SIZE, _SIZE), interpolation=cv2.INTER_CUBIC)
+        grid = rng.standard_normal((cells * 2**octave,) * 2, np.float32)
+        grid = cv2.resize(grid, (fine, fine), interpolation=cv2.INTER_CUBIC)
         total += falloff**octave * grid
-    return (total - total.mean()) / total.std()
+    total = (total - total.mean()) / total.std()
+    return np.asarray(cv2.resize(total, (_SIZE, _SIZE), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
 def marbled(rng: np.random.Generator) -> Float32:
@@ -43,15 +47,15 @@ def marbled(rng: np.random.Generator) -> Float32:
 
 def tissue(rng: np.random.Generator) -> Float32:
     """Wet, lumpy tissue with veins and glints; (S, S, 3) BGR."""
-    lumps = smooth_noise(rng, 12, 3, 0.45)
+    lumps = cv2.GaussianBlur(smooth_noise(rng, 12, 3, 0.45), (0, 0), _PER_MM)
     slope = [cv2.Sobel(lumps, cv2.CV_32F, *way, ksize=5) for way in ((1, 0), (0, 1))]
     way = rng.uniform(0, 2 * np.pi)
-    lit = np.cos(way) * slope[0] + np.sin(way) * slope[1]
-    light = 1 + 0.11 * lit / lit.std() + 0.07 * smooth_noise(rng, 3, 2)
+    lit = np.float32(np.cos(way)) * slope[0] + np.float32(np.sin(way)) * slope[1]
+    light = 1 + 0.13 * lit / lit.std() + 0.07 * smooth_noise(rng, 3, 2)
     pale, red = rng.normal([128, 146, 196], 12), rng.normal([66, 72, 158], 10)
     share = 1 / (1 + np.exp(-1.1 * smooth_noise(rng, 9, 4)))[..., None]
     texture = (pale + (red - pale) * share) * light[..., None]
-    texture *= 1 + 0.03 * smooth_noise(rng, 200, 3, 0.8)[..., None]
+    texture = texture.astype(np.float32) * (1 + 0.03 * smooth_noise(rng, 200, 3, 0.8)[..., None])
     half = _SIZE / 2 / _PER_MM
     veins = [
         wander(
@@ -59,7 +63,7 @@ def tissue(rng: np.random.Generator) -> Float32:
         )
         for _ in range(rng.integers(50, 80))
     ]
-    texture = with_veins(texture.astype(np.float32), rng, veins, (0.2, 1.1))
+    texture = with_veins(texture, rng, veins, (0.2, 1.1))
     return with_glints(texture, rng, lit)
 
 
@@ -99,11 +103,10 @@ def with_veins(
         width, depth = rng.uniform(*widths) * _PER_MM, rng.uniform(0.25, 0.75)
         pixels = np.round((line * _PER_MM + _SIZE / 2) * 16).astype(np.int32)
         vein = np.zeros((_SIZE, _SIZE), np.uint8)
-        pieces = np.array_split(np.arange(len(pixels)), 4)
-        for k, piece in enumerate(pieces):
+        for piece, share in zip(np.array_split(np.arange(len(pixels)), 8), _TAPER, strict=True):
             part = pixels[piece[0] : piece[-1] + 2]
-            thickness = max(round(width * (1 - 0.2 * k)), 1)
-            cv2.polylines(vein, [part], False, 255, thickness, cv2.LINE_AA, shift=4)
+            thickness = max(round(width * share), 1)
+            cv2.polylines(vein, [part], False, round(255 * share), thickness, cv2.LINE_AA, shift=4)
         ink = np.maximum(ink, vein * np.float32(depth / 255))
     ink = cv2.GaussianBlur(ink, (0, 0), 0.12 * _PER_MM)[..., None]
     return texture * (1 - ink * np.array([0.3, 0.5, 0.42], np.float32))
@@ -111,11 +114,11 @@ def with_veins(
 
 def with_glints(texture: Float32, rng: np.random.Generator, facing: Float32) -> Float32:
     """The texture with small bright spots in clusters where it faces the light."""
-    wet = smooth_noise(rng, 14, 2) + 0.5 * facing / facing.std()
+    wet = smooth_noise(rng, 14, 2) + facing / (2 * facing.std())
     speck = smooth_noise(rng, 150, 2, 0.6)
     glint = np.clip((speck - 1.7) * 4, 0, 1) * np.clip((wet - 1.2) * 3, 0, 1)
     glint = cv2.GaussianBlur(glint, (0, 0), 0.1 * _PER_MM)[..., None]
-    return texture + (255 - texture) * np.clip(1.6 * glint, 0, 1)
+    return texture + (255 - texture) * np.minimum(1.6 * glint, 1)
 
 
 def with_hole(texture: Float32, place: Float64, radius: float) -> Float32:
