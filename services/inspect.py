@@ -7,15 +7,13 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from services.run_folder import RunFolder
 from services.summary import WRONG_PX, ProcessSummary, RunSummary, ThreadSummary, summarize
+from services.tables import new_table, number, report_console
 from suturetrack.types import Status
-
-_FILE_WIDTH = 110
 
 
 @dataclass(frozen=True)
@@ -32,12 +30,7 @@ def run(config: InspectConfig) -> None:
     Raises:
         InputError: the folder holds no readable recording.
     """
-    show(summarize(RunFolder(config.run_dir)), _console())
-
-
-def _console() -> Console:
-    console = Console()
-    return console if console.is_terminal else Console(width=_FILE_WIDTH)
+    show(summarize(RunFolder(config.run_dir)), report_console())
 
 
 def show(summary: RunSummary, console: Console) -> None:
@@ -60,7 +53,7 @@ def show(summary: RunSummary, console: Console) -> None:
 
 
 def _processes(processes: list[ProcessSummary]) -> Table:
-    table = _table(
+    table = new_table(
         "Processes (latency from the release of the frame to the result, ms)",
         *("process", "frames", "per second", "latency p50", "p99", "max", "dropped", "memory MB"),
     )
@@ -75,7 +68,7 @@ def _processes(processes: list[ProcessSummary]) -> Table:
 
 
 def _status(threads: list[ThreadSummary]) -> Table:
-    table = _table(
+    table = new_table(
         "Status (% of the frames since the seed)",
         "thread",
         "from frame",
@@ -94,23 +87,23 @@ def _status(threads: list[ThreadSummary]) -> Table:
 
 
 def _lengths(threads: list[ThreadSummary]) -> Table:
-    table = _table(
+    table = new_table(
         "Length (mm; Table I)",
         *("thread", "true", "measured", "sigma", "error %", "control points"),
     )
     for t in threads:
         length, points = t.length_mm, t.control_points
         table.add_row(
-            *(t.thread, _number(t.true_length_mm, 1)),
-            *(_number(length.mean, 2), _number(length.sigma, 2)),
-            _number(t.length_error_percent, 2),
-            f"{_number(points.smallest, 0)} to {_number(points.largest, 0)}",
+            *(t.thread, number(t.true_length_mm, 1)),
+            *(number(length.mean, 2), number(length.sigma, 2)),
+            number(t.length_error_percent, 2),
+            f"{number(points.smallest, 0)} to {number(points.largest, 0)}",
         )
     return table
 
 
 def _energies(threads: list[ThreadSummary]) -> Table:
-    table = _table(
+    table = new_table(
         "Energies (eqs. 4 and 7; best: -1 an image)",
         *("thread", "left mean", "left worst", "right mean", "right worst", "ends mean"),
         *("ends worst", "bending mean"),
@@ -120,12 +113,12 @@ def _energies(threads: list[ThreadSummary]) -> Table:
         numbers = [
             x for n in ("image_left", "image_right", "end") for x in (e[n].mean, e[n].largest)
         ]
-        table.add_row(t.thread, *(_number(x, 3) for x in (*numbers, e["internal"].mean)))
+        table.add_row(t.thread, *(number(x, 3) for x in (*numbers, e["internal"].mean)))
     return table
 
 
 def _errors(threads: list[ThreadSummary]) -> Table:
-    table = _table(
+    table = new_table(
         f"Distance from the truth, mean over the curve (wrong: called tracking, but over {WRONG_PX:g} px)",
         *("thread", "p50 mm", "p95 mm", "worst mm", "p50 px", "worst px", "at frame"),
         "wrong %",
@@ -134,20 +127,8 @@ def _errors(threads: list[ThreadSummary]) -> Table:
         mm, px = t.error_mm, t.error_px
         table.add_row(
             t.thread,
-            *(_number(x, 3) for x in (mm.p50, mm.p95, mm.largest)),
-            *(_number(x, 2) for x in (px.p50, px.largest)),
-            *(str(t.worst_frame), _number(100 * t.wrong_share, 1)),
+            *(number(x, 3) for x in (mm.p50, mm.p95, mm.largest)),
+            *(number(x, 2) for x in (px.p50, px.largest)),
+            *(str(t.worst_frame), number(100 * t.wrong_share, 1)),
         )
     return table
-
-
-def _table(title: str, first: str, *others: str) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
-    table.add_column(first, no_wrap=True)
-    for name in others:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table
-
-
-def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if value == value else "-"

@@ -8,11 +8,12 @@ import sys
 import tempfile
 import warnings
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pyarrow as pa
 from rerun.chunk import RrdReader
@@ -22,6 +23,7 @@ from suturetrack.camera import Camera, StereoRig
 from suturetrack.types import (
     Energies,
     Float64,
+    Image,
     InputError,
     Nurbs,
     Stamp,
@@ -112,6 +114,15 @@ class RunFolder:
             )
         return series
 
+    def images(self, frames: Container[int]) -> dict[tuple[int, str], Image]:
+        """The raw images of some frames, by frame and view ("left", "right"); BGR or gray."""
+        found = {}
+        for row in self.rows("/rig/left/image", "/rig/right/image"):
+            image = _image(row) if row.get("frame") in frames else None
+            if image is not None:
+                found[row["frame"], row["entity"].split("/")[2]] = image
+        return found
+
     def rig(self) -> StereoRig:
         """The cameras of the run.
 
@@ -195,18 +206,31 @@ def _rows(entity: str, batch: pa.RecordBatch) -> Iterator[Row]:
 
 def _value(scalar: pa.Scalar) -> Any:
     if isinstance(scalar, pa.ListScalar):
-        values = scalar.values
-        return _array(values)
+        return _array(scalar.values)
     return scalar.value if isinstance(scalar, pa.TimestampScalar) else scalar.as_py()
 
 
 def _array(values: pa.Array) -> Any:
-    if pa.types.is_nested(values.type) and not pa.types.is_fixed_size_list(values.type):
-        return values.to_pylist()
+    """NumPy arrays for lists of numbers and of vectors; lists of them for lists of lists."""
     if pa.types.is_fixed_size_list(values.type):
         flat = values.flatten().to_numpy(zero_copy_only=False)
         return flat.reshape(len(values), values.type.list_size)
+    if pa.types.is_list(values.type):
+        return [_array(inner.values) for inner in values]
+    if pa.types.is_nested(values.type):
+        return values.to_pylist()
     return values.to_numpy(zero_copy_only=False)
+
+
+def _image(row: Row) -> Image | None:
+    if "EncodedImage:blob" in row:
+        blob = np.asarray(row["EncodedImage:blob"][0], np.uint8)
+        return np.asarray(cv2.imdecode(blob, cv2.IMREAD_UNCHANGED), np.uint8)
+    if "Image:buffer" in row:
+        form = row["Image:format"][0]
+        pixels = np.asarray(row["Image:buffer"][0], np.uint8)
+        return pixels.reshape(form["height"], form["width"], -1).squeeze()
+    return None
 
 
 def _stamp(row: Row, kind: str) -> Stamp:

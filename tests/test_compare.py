@@ -1,0 +1,68 @@
+"""Runs side by side: what differs is told, what is equal is equal."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.compare import CompareConfig, run
+from services.recording import Recorder
+from suturetrack import nurbs
+from suturetrack.camera import StereoRig
+from suturetrack.types import Energies, InputError, Nurbs, Stamp, Status, ThreadState
+
+
+def record(run_dir: Path, rig: StereoRig, curve: Nurbs, shift_mm: float, lost: int = 0) -> None:
+    """Twenty frames; the curve moves away by `shift_mm` in frame 12, and is lost in the last ones."""
+    away = nurbs.curve_from(3, curve.knots, curve.control_points + np.array([0, 0, shift_mm]))
+    with Recorder(run_dir, "tracker", "light", rig) as recorder:
+        for i in range(20):
+            status = Status.LOST if i >= 20 - lost else Status.TRACKING
+            bits = np.full(9, 0.1), np.ones(9, bool)
+            shape = away if i == 12 else curve
+            stamp, energies = Stamp(i, i, 10**18), Energies(-0.9, -0.9, -1, 2)
+            state = ThreadState(stamp, "0", status, shape, 200.0, energies, *bits)
+            recorder.states([state], published_ns=10**18 + 1)
+
+
+@pytest.fixture
+def runs(tmp_path: Path, rig: StereoRig, curve: Nurbs) -> tuple[Path, Path, Path]:
+    for name, shift_mm, lost in (("first", 0.0, 0), ("moved", 2.0, 0), ("lost", 0.0, 5)):
+        record(tmp_path / name, rig, curve, shift_mm, lost)
+    return tmp_path / "first", tmp_path / "moved", tmp_path / "lost"
+
+
+def test_equal_runs_pass_the_strictest_check(
+    tmp_path: Path, runs: tuple[Path, Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(CompareConfig((runs[0], runs[0]), tolerance_mm=0.0, tolerance_tracking=0.0))
+    distances = next(x for x in capsys.readouterr().out.splitlines() if " 0.000 " in x)
+    assert distances.split()[:4] == ["first", "0", "20", "20"]
+
+
+def test_a_moved_curve_is_measured_and_fails_its_tolerance(
+    tmp_path: Path, runs: tuple[Path, Path, Path]
+) -> None:
+    table = tmp_path / "distances.csv"
+    run(CompareConfig(runs[:2], tolerance_mm=2.1, output=table))
+    with table.open() as file:
+        mm = [float(line["distance_mm"]) for line in csv.DictReader(file)]
+    assert len(mm) == 20
+    assert 0.5 < mm.pop(12) <= 2.0
+    assert max(mm) == 0.0
+    with pytest.raises(SystemExit, match=r"moved: thread 0 is up to [\d.]+ mm from first"):
+        run(CompareConfig(runs[:2], tolerance_mm=0.4))
+
+
+def test_fewer_tracked_frames_fail_their_tolerance(runs: tuple[Path, Path, Path]) -> None:
+    run(CompareConfig((runs[0], runs[2]), tolerance_tracking=26.0))
+    with pytest.raises(SystemExit, match=r"lost: thread 0 is tracked in 75\.0 % .* not 100\.0 %"):
+        run(CompareConfig((runs[0], runs[2]), tolerance_tracking=24.0))
+
+
+def test_one_run_is_nothing_to_compare(runs: tuple[Path, Path, Path]) -> None:
+    with pytest.raises(InputError, match="two or more"):
+        run(CompareConfig(runs[:1]))
