@@ -9,9 +9,10 @@ import pytest
 from rich.console import Console
 
 from services.course import Loss, losses
-from services.inspect import show
+from services.inspect import InspectConfig, run
 from services.messages import Health, Latency
 from services.recording import Recorder
+from services.report import show
 from services.run_folder import RunFolder
 from services.summary import RunSummary, summarize
 from suturetrack import nurbs
@@ -93,6 +94,23 @@ def test_the_report_prints_the_figures(summary: RunSummary) -> None:
     text = console.export_text()
     for words in ("sigma", "200.00", "24.0", "60.0", "thread 0 lost at frame 13 until frame 17"):
         assert words in text
+
+
+def test_the_page_holds_plots_and_key_frames_and_needs_nothing_else(
+    tmp_path: Path, rig: StereoRig, curve: Nurbs
+) -> None:
+    record(tmp_path, rig, curve, shift_mm=50.0)
+    output = tmp_path / "run.html"
+    run(InspectConfig(tmp_path, output))
+    text = output.read_text()
+    for plot in ("Length, mm", "Image energy", "Distance from the truth, mm", "Latency, ms"):
+        assert f"<h3>{plot}" in text
+    for moment in ("5: initialisation", "11: the worst frame", "13: lost", "21: lost"):
+        assert f"Frame {moment}" in text
+    assert text.count("<img alt='' src='data:image/jpeg;base64,") == 4
+    outside = text.replace("data:image/jpeg", "").replace("http://www.w3.org", "")
+    assert "http" not in outside
+    assert "<script" not in text
 
 
 def test_losses_before_the_first_sight_do_not_count() -> None:
