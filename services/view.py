@@ -3,27 +3,41 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
+import uuid
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
+import rerun as rr
 import tyro
 
+from services import topics
+from services.bus import Bus, NoAnswer
+from services.live import LiveView
+from services.recording import APPLICATION
 from services.run_folder import RunFolder
+from services.service import ServiceConfig
+from services.service import run as run_service
 from suturetrack.types import InputError
 
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """Opens a run in the Rerun viewer; nothing but this machine can reach it."""
+    """Opens a run in the Rerun viewer, or what is running now; only this machine can reach it."""
 
-    run_dir: Annotated[Path, tyro.conf.Positional]
-    """The run's folder."""
+    run_dir: Annotated[Path | None, tyro.conf.Positional] = None
+    """The run's folder; without it, the live view of a running system."""
     web: bool = False
     """Shows the viewer in the browser, for a machine without a display."""
+    rig: str = "rig"
+    """Name of the rig to look at live."""
+    zenoh: Path | None = None
+    """The Zenoh configuration file of the live system, if it has one."""
 
 
 def run(config: ViewConfig) -> None:
@@ -32,22 +46,53 @@ def run(config: ViewConfig) -> None:
     Raises:
         InputError: nothing to show, or no display to show it on.
     """
-    folder = RunFolder(config.run_dir)
-    for problem in folder.problems:
-        print(f"view: {problem}", file=sys.stderr)
     has_display = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)
     if not config.web and not has_display:
         raise InputError("there is no display; --web shows the run in a browser")
-    status = subprocess.run(command(folder, config.web), check=False).returncode
+    if config.run_dir is None:
+        service = ServiceConfig(rig=config.rig, zenoh=config.zenoh)
+        run_service("view", service, lambda running: _follow(running.bus, config.web))
+        return
+    folder = RunFolder(config.run_dir)
+    for problem in folder.problems:
+        print(f"view: {problem}", file=sys.stderr)
+    status = subprocess.run(command(config.web, *files(folder)), check=False).returncode
     if status:
         raise InputError(f"the Rerun viewer ended with status {status}")
 
 
-def command(folder: RunFolder, web: bool) -> list[str]:
-    """The viewer's own command line, the file with the layout of all threads first."""
-    files = sorted(folder.files, key=lambda file: not file.name.startswith("tracker"))
+def _follow(bus: Bus, web: bool) -> None:
+    """Shows what is published until the viewer is closed."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    window = subprocess.Popen(command(web, "--port", str(port), "--hide-welcome-screen"))
+    try:
+        rig = None
+        while rig is None and window.poll() is None and not bus.stop.is_set:
+            with suppress(NoAnswer):
+                rig = bus.ask(topics.CALIBRATION, None, timeout=1.0)
+        if rig is None:
+            return
+        stream = rr.RecordingStream(APPLICATION, recording_id=uuid.uuid4())
+        stream.set_sinks(rr.GrpcSink(f"rerun+http://127.0.0.1:{port}/proxy"))
+        live = LiveView(bus, rig, stream)
+        while window.poll() is None and not bus.stop.is_set:
+            live.step()
+    finally:
+        window.terminate()
+        window.wait()
+
+
+def files(folder: RunFolder) -> list[str]:
+    """The recordings, the one with the layout of all threads first."""
+    return [str(f) for f in sorted(folder.files, key=lambda f: not f.name.startswith("tracker"))]
+
+
+def command(web: bool, *arguments: str) -> list[str]:
+    """The viewer's own command line."""
     options = ["--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
-    return [str(viewer()), *options, *map(str, files)]
+    return [str(viewer()), *options, *arguments]
 
 
 def viewer() -> Path:

@@ -20,7 +20,7 @@ from services.blueprint import blueprint
 from services.messages import Health, Latency
 from services.recording import Recorder
 from services.run_folder import RunFolder
-from services.view import command, viewer
+from services.view import command, files
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Growth, Initialization, ViewGrowth
@@ -127,13 +127,11 @@ def headless_viewer(run_dir: Path) -> Iterator[ViewerClient]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    options = ["--headless", "--hide-welcome-screen", "--port", str(port), "--bind", "127.0.0.1"]
-    process = subprocess.Popen(
-        [str(viewer()), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    call = command(False, "--headless", "--hide-welcome-screen", "--port", str(port))
+    process = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         client = _connected(port)
-        client.open([arg for arg in command(RunFolder(run_dir), False) if arg.endswith(".rrd")])
+        client.open(files(RunFolder(run_dir)))
         _wait_until(lambda: client.get_state().active_recording is not None)
         yield client
     finally:

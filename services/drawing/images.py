@@ -39,7 +39,7 @@ def cameras(rig: StereoRig) -> Iterator[Entry]:
             image_from_camera=camera.matrix,
             resolution=rig.image_size,
             camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=3 * rig.baseline,
+            image_plane_distance=2 * rig.baseline,
         )
         yield f"/rig/{view}/image", pinhole
     yield from growth_style()

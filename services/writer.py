@@ -1,0 +1,157 @@
+"""Values into a Rerun stream, at their time, one function a type."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from services import drawing
+from services.blueprint import blueprint
+from services.drawing import Entry, Level
+from services.messages import Health
+from suturetrack import nurbs
+from suturetrack.camera import StereoRig
+from suturetrack.initialization import Initialization, InitializationError
+from suturetrack.types import Float64, RidgeField, Stamp, Status, StereoFrame, ThreadState, Truth
+
+
+class Writer:
+    """What one process sees and decides, written to a stream; to none once it is closed."""
+
+    def __init__(
+        self, stream: rr.RecordingStream | None, process: str, level: Level, rig: StereoRig
+    ) -> None:
+        self.process, self.level, self.rig = process, level, rig
+        self.stream = stream
+        self._stamp: Stamp | None = None
+        self._statuses: dict[str, Status | None] = {}
+        self._target: Float64 | None = None
+
+    def describe(self) -> None:
+        """Writes what does not change: cameras, and the look of what was introduced so far."""
+        self.write_static(drawing.cameras(self.rig))
+        self.write_static(drawing.process_style(self.process))
+        for thread in self._statuses:
+            self.write_static(drawing.thread_style(thread))
+
+    def frame(self, frame: StereoFrame, published_ns: int | None = None) -> None:
+        """Records both images; `published_ns` is now when not given."""
+        if self.stream is not None:
+            self.write(frame.stamp, drawing.frame(frame, self.level))
+            self._latency(frame.stamp, published_ns)
+
+    def field(self, field: RidgeField, published_ns: int | None = None) -> None:
+        """Records both fields."""
+        if self.stream is not None:
+            self.write(field.stamp, drawing.field(field, self.rig, self.level))
+            self._latency(field.stamp, published_ns)
+
+    def states(self, states: Sequence[ThreadState], published_ns: int | None = None) -> None:
+        """Records the states of all threads at one frame; lengths in the calibration's unit."""
+        if self.stream is None or not states:
+            return
+        for state in states:
+            self._introduce(state)
+        stamp, published_ns = states[0].stamp, published_ns or time.time_ns()
+        self.write(stamp, drawing.states(states, self.rig, published_ns))
+        self._latency(stamp, published_ns)
+        for state in states:
+            self._tell(state)
+
+    def initialization(
+        self, stamp: Stamp, thread: str, result: Initialization | InitializationError
+    ) -> None:
+        """Records how a thread was looked for in one field; the timeline `growth` counts the steps."""
+        stream = self.stream
+        if stream is None:
+            return
+        for step, entries in enumerate(self._growth(thread, result), 1):
+            stream.set_time("growth", sequence=step)
+            self.write(stamp, entries)
+        stream.disable_timeline("growth")
+        if isinstance(result, InitializationError):
+            self.write(stamp, drawing.failure(thread, result.candidates, self.rig))
+            self.log(f"thread {thread} not found: {result.reason}", "WARN")
+        else:
+            found = f"thread {thread} found with confidence {result.confidence:.2f}"
+            self.log("; ".join((found, *result.reasons)))
+
+    def truth(self, truth: Truth) -> None:
+        """Records where a synthetic thread really is."""
+        if self.stream is not None:
+            self.write(truth.stamp, drawing.truth(truth))
+
+    def health(self, health: Health) -> None:
+        """Records the process's heartbeat, at its newest frame."""
+        quantities = ("rate_hz", "dropped", "memory_mb")
+        self.write(
+            health.stamp,
+            (
+                (f"/plots/{name}/{health.process}", rr.Scalars(getattr(health, name)))
+                for name in quantities
+            ),
+        )
+
+    def log(self, text: str, level: str = "INFO") -> None:
+        """Records a line of the process's log (DEBUG, INFO, WARN, ERROR), at the newest frame."""
+        self.write(
+            self._stamp,
+            [(f"/log/{self.process}", rr.TextLog(f"{self.process}: {text}", level=level))],
+        )
+
+    def layout(self) -> rrb.Blueprint:
+        """How the viewer shows the threads that were introduced so far."""
+        ahead = np.array([0.0, 0.0, 10 * self.rig.baseline])
+        target = ahead if self._target is None else self._target
+        return blueprint(list(self._statuses), target)
+
+    def write(self, stamp: Stamp | None, entries: Iterable[Entry]) -> None:
+        """Writes entries at the time of `stamp`, or else of the newest one."""
+        if self.stream is None:
+            return
+        if stamp is not None:
+            self._stamp = stamp
+            # Times belong to the calling thread, so they are set on every call.
+            self.stream.set_time("frame", sequence=stamp.frame)
+            self.stream.set_time("capture", timestamp=np.datetime64(stamp.capture_ns, "ns"))
+        for entity, *what in entries:
+            self.stream.log(entity, *what)
+
+    def write_static(self, entries: Iterable[Entry]) -> None:
+        """Writes entries that hold at all times."""
+        assert self.stream is not None
+        for entity, *what in entries:
+            self.stream.log(entity, *what, static=True)
+
+    def _latency(self, stamp: Stamp, published_ns: int | None) -> None:
+        latency_ms = ((published_ns or time.time_ns()) - stamp.released_ns) / 1e6
+        self.write(stamp, [(f"/plots/latency_ms/{self.process}", rr.Scalars(latency_ms))])
+
+    def _growth(
+        self, thread: str, result: Initialization | InitializationError
+    ) -> Iterable[list[Entry]]:
+        return () if result.growth is None else drawing.growth(thread, result.growth, self.rig)
+
+    def _introduce(self, state: ThreadState) -> None:
+        assert self.stream is not None
+        if state.thread not in self._statuses:
+            self._statuses[state.thread] = None
+            self.write_static(drawing.thread_style(state.thread))
+            self._target = None
+        if self._target is None and state.curve is not None:
+            self._target = nurbs.evaluate(state.curve, np.array([0.5]))[0]
+            self.stream.send_blueprint(self.layout())
+
+    def _tell(self, state: ThreadState) -> None:
+        """The state's events and changes of status in words."""
+        name = f"thread {state.thread}"
+        for event in state.events:
+            # Control points come and go all the time, which their plot shows better.
+            self.log(f"{name}: {event}", "DEBUG" if event.startswith("control points") else "INFO")
+        if state.status != self._statuses[state.thread]:
+            self._statuses[state.thread] = state.status
+            self.log(f"{name}: {state.status}", "WARN" if state.status is Status.LOST else "INFO")
