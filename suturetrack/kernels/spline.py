@@ -188,18 +188,6 @@ def band_of_inverse(factor: Float64) -> Float64:
 
 
 @numba.njit(cache=True, nogil=True)
-def diagonal_blocks(band: Float64) -> Float64:
-    """(n + 1, 3, 3) blocks on the diagonal of a symmetric lower band."""
-    count = len(band) // 3
-    blocks = np.empty((count, 3, 3))
-    for i in range(count):
-        for a in range(3):
-            for b in range(a + 1):
-                blocks[i, a, b] = blocks[i, b, a] = band[3 * i + a, a - b]
-    return blocks
-
-
-@numba.njit(cache=True, nogil=True)
 def sample_covariance(first: Int64, values: Float64, inverse: Float64) -> Float64:
     """(k, 3, 3) covariance of the samples from the band of the control points' covariance."""
     count = len(first)

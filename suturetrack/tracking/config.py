@@ -40,9 +40,8 @@ class TrackingConfig:
     """gauss-newton: sub-pixel offsets along the normals and a banded least-squares step; paper: the
     forces and updates of eqs. (4)-(16)."""
     search_px: float = 5.0
-    """How far to each side of the predicted curve the thread is looked for first."""
-    wide_search_px: float = 32.0
-    """How far it is looked for when the first search does not find it."""
+    """How far to each side of the predicted curve the thread is looked for first; up to 6.5 times as
+    far where it is not found."""
     iterations: int = 3
     """Gauss-Newton steps a field."""
     noise_px: float = 0.1
@@ -50,7 +49,7 @@ class TrackingConfig:
     drift_px: float = 2.0
     """How far the thread may leave the prediction from one field to the next, as a standard
     deviation; unseen stretches are held to the prediction by this."""
-    smoothing: float = 30.0
+    smoothing: float = 100.0
     """Weight of the curve's bending; without unit."""
     stretch: float = 0.02
     """Standard deviation of the local stretch of the curve, relative."""

@@ -19,50 +19,43 @@ _CROWDED = 1.0
 _SPARSE = 1.5
 
 
-def rearrange(curve: Nurbs, moving: Float64, rig: StereoRig) -> tuple[Nurbs, Float64, int, int]:
-    """Inserts and removes knots where the shape asks for it.
-
-    Args:
-        curve: cubic, 3-D.
-        moving: (n + 1, m) coefficients of functions on the same knots, carried along.
+def rearrange(curve: Nurbs, rig: StereoRig) -> tuple[Nurbs, int, int]:
+    """Inserts and removes knots where the shape of a cubic 3-D curve asks for it.
 
     Returns:
-        The curve, the carried coefficients, and how many control points were inserted and removed.
+        The curve, and how many control points were inserted and removed.
     """
-    edges = np.unique(curve.knots)
     width, wanted = _spans(curve, rig)
     crowded = _crowded(width, wanted)
-    both = curve_from(3, curve.knots, np.c_[curve.control_points, moving])
-    if len(crowded):
-        both = refit(both, np.delete(edges[1:-1], crowded))
-        edges = np.unique(both.knots)
-        width, wanted = _spans(_spatial(both), rig)
+    if crowded:
+        curve = refit(curve, np.delete(np.unique(curve.knots)[1:-1], crowded))
+        width, wanted = _spans(curve, rig)
+    edges = np.unique(curve.knots)
     sparse = np.flatnonzero(width > _SPARSE * wanted)
     for i in sparse:
-        both = insert_knot(both, float(edges[i] + edges[i + 1]) / 2)
-    return _spatial(both), both.control_points[:, 3:], len(sparse), len(crowded)
+        curve = insert_knot(curve, float(edges[i] + edges[i + 1]) / 2)
+    return curve, len(sparse), len(crowded)
 
 
 def respace(
-    curve: Nurbs, moving: Float64, rig: StereoRig, spacing_px: tuple[float, float]
-) -> tuple[Nurbs, Float64, int, int]:
+    curve: Nurbs, rig: StereoRig, spacing_px: tuple[float, float]
+) -> tuple[Nurbs, int, int]:
     """The paper's rule: prunes control points that are too close and inserts where the gap is large.
 
-    Takes and returns what `rearrange` does; `spacing_px` is the range of the gaps.
+    Returns what `rearrange` does; `spacing_px` is the range of the gaps.
     """
     left, right = rig.project(curve.control_points)
     gaps = np.linalg.norm(np.diff((left + right) / 2, axis=0), axis=1)
-    both = curve_from(3, curve.knots, np.c_[curve.control_points, moving])
     close = [int(i) for i in np.flatnonzero(gaps[1:-2] + gaps[2:-1] < 2 * spacing_px[0])]
     close = [i for n, i in enumerate(close) if n == 0 or close[n - 1] < i - 1]
+    near = [curve.knots[i + 4] for i in close if i + 4 < len(curve.knots) - 4]
     wide = _midpoints(curve.knots, np.flatnonzero(gaps > spacing_px[1]))
     for s in wide:
-        both = insert_knot(both, s)
-    if close:
-        near = {float(curve.knots[i + 4]) for i in close if i + 4 < len(curve.knots) - 4}
-        interior = np.unique(both.knots)[1:-1]
-        both = refit(both, interior[~np.isin(interior, list(near))])
-    return _spatial(both), both.control_points[:, 3:], len(wide), len(close)
+        curve = insert_knot(curve, s)
+    if near:
+        interior = np.unique(curve.knots)[1:-1]
+        curve = refit(curve, interior[~np.isin(interior, near)])
+    return curve, len(wide), len(near)
 
 
 def _midpoints(knots: Float64, gaps: Int64) -> list[float]:
@@ -81,26 +74,13 @@ def refit(curve: Nurbs, interior: Float64) -> Nurbs:
     samples = Samples.at(knots, s)
     weight = np.ones(len(s))
     weight[[0, -1]] = 1e6
-    points = evaluate(curve, s)
-    count = len(knots) - 4
+    band = np.zeros((3 * (len(knots) - spline.ORDER), spline.BANDWIDTH))
+    right = np.zeros(len(band))
     information = weight[:, None, None] * np.eye(3)
-    columns = []
-    for block in np.split(points, range(3, points.shape[1], 3), axis=1):
-        band, right = np.zeros((3 * count, spline.BANDWIDTH)), np.zeros(3 * count)
-        padded = np.zeros((len(s), 3))
-        padded[:, : block.shape[1]] = block
-        spline.add_rows(
-            samples.first,
-            samples.table[0],
-            information,
-            weight[:, None] * padded,
-            band,
-            right,
-        )
-        band[:, 0] += 1e-9
-        spline.factorize(band)
-        columns.append(spline.solve_factorized(band, right).reshape(-1, 3)[:, : block.shape[1]])
-    return curve_from(3, knots, np.hstack(columns))
+    pull = weight[:, None] * evaluate(curve, s)
+    spline.add_rows(samples.first, samples.table[0], information, pull, band, right)
+    spline.factorize(band)
+    return curve_from(3, knots, spline.solve_factorized(band, right).reshape(-1, 3))
 
 
 def _spans(curve: Nurbs, rig: StereoRig) -> tuple[Float64, Float64]:
@@ -130,7 +110,3 @@ def _crowded(width: Float64, wanted: Float64) -> list[int]:
         if merged < _CROWDED * needed and (not chosen or chosen[-1] < i - 1):
             chosen.append(i)
     return chosen
-
-
-def _spatial(curve: Nurbs) -> Nurbs:
-    return curve_from(3, curve.knots, curve.control_points[:, :3])

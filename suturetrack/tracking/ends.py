@@ -15,6 +15,8 @@ from suturetrack.types import Float64, Nurbs, RidgeField
 _STEP_PX = 0.5
 _INWARD_PX, _OUTWARD_PX = 40.0, 10.0
 _HALF = 0.5
+# Responses below this part of a clear view are background.
+_FAINT = 0.2
 # What is shorter than this is a speck behind the end and not its continuation.
 _SOLID_PX = 8.0
 
@@ -71,20 +73,68 @@ def _smooth(profile: Float64) -> Float64:
 
 
 def _outer_boundary(x: Float64, mean: Float64, least: Float64) -> float | None:
-    """Where the outermost solid run that begins on the curve ends, to a part of a pixel."""
-    above = (mean > _HALF) & ((x <= 0) | (least > _HALF))
-    above = search.solid(above, np.full(len(x), _STEP_PX), _SOLID_PX)
-    starts = np.flatnonzero(above & ~np.r_[False, above[:-1]])
-    starts = starts[x[starts] <= 0]
-    if not len(starts):
+    """Where the outermost solid run that begins on the curve ends, to a part of a pixel.
+
+    The thread may fade towards its end: the step is looked for at half of what it shows there.
+    """
+    runs = search.solid((x <= 0) & (mean > _FAINT), np.full(len(x), _STEP_PX), _SOLID_PX)
+    if not runs.any():
         return None
-    last = int(starts[-1])
-    while last + 1 < len(x) and above[last + 1]:
+    last = int(np.flatnonzero(runs)[-1])
+    plateau = float(np.median(mean[max(last - 24, 0) : last - 6]))
+    threshold = _HALF * plateau
+    while last > 0 and mean[last] < threshold:
+        last -= 1
+    beyond = max(threshold, _FAINT)
+    while (
+        last + 1 < len(x)
+        and mean[last + 1] >= threshold
+        and (x[last + 1] <= 0 or least[last + 1] >= beyond)
+    ):
         last += 1
     if last + 1 == len(x):
         return float(x[-1])
-    share = (mean[last] - _HALF) / max(float(mean[last] - mean[last + 1]), 1e-6)
+    share = (mean[last] - threshold) / max(float(mean[last] - mean[last + 1]), 1e-6)
     return float(x[last] + _STEP_PX * min(max(share, 0.0), 1.0))
+
+
+# How far an end moves along the thread from one field to the next, if it is not hidden at once.
+_DRAWN_IN_PX = 4.0
+_SETTLING_S = 0.3
+_HELD_S = 1.5
+_NS = 1e-9
+
+
+class EndWatch:
+    """Decides from field to field whether an end has moved or is only hidden."""
+
+    def __init__(self, now_ns: int) -> None:
+        self._found_ns = now_ns
+        self._seen_ns = [now_ns, now_ns]
+        self.seen = (True, True)
+
+    def moves(
+        self, start: EndStep | None, stop: EndStep | None, now_ns: int
+    ) -> tuple[float, float]:
+        """How far to move both ends outward, as parts of the curve's length.
+
+        An end that vanishes at once, faster than a thread can be drawn in, is hidden: it is held for
+        a while. What one end loses and the other gains is the thread sliding along itself.
+        """
+        steps = start, stop
+        growth_px = sum(step.offset_px for step in steps if step)
+        fresh = (now_ns - self._found_ns) * _NS < _SETTLING_S
+        moves, seen = [0.0, 0.0], [False, False]
+        for end, step in enumerate(steps):
+            if step is None:
+                continue
+            seen[end] = step.offset_px > -_DRAWN_IN_PX or growth_px > -_DRAWN_IN_PX
+            if seen[end]:
+                self._seen_ns[end] = now_ns
+            if seen[end] or fresh or (now_ns - self._seen_ns[end]) * _NS > _HELD_S:
+                moves[end] = step.offset
+        self.seen = seen[0], seen[1]
+        return moves[0], moves[1]
 
 
 def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:

@@ -23,13 +23,13 @@ _STEP_PX = 0.5
 # Offsets measured closer than this along the thread share their noise: the filter smears it.
 _CORRELATION_PX = 4.0
 _PEAK_HALF_PX = 1.5
-_ROUGHNESS = 0.1
-_LEAST_RESPONSE = 0.35
+_ROUGHNESS = 0.2
+_LEAST_RESPONSE = 0.25
 _REFINED_PX = 3.0
 # A shorter run of samples that look like thread is chance.
 _SHORTEST_RUN_PX = 10.0
 _OUTLIER_PX = 0.5
-_EVEN = 15.0
+_EVEN = 150.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +56,6 @@ class Fit:
     """(k, 2) px between the curve and what was found, left and right; nan where nothing was."""
     covariance: Float64
     """(k, 3, 3) of the samples' positions."""
-    gain: Float64
-    """(n + 1, 3, 3) how far the images, and not the prediction, placed each control point."""
 
 
 def search_normals(
@@ -106,7 +104,7 @@ def fit(
         control_points = control_points + equations.solve()
     curve = curve_from(spline.DEGREE, predicted.knots, control_points)
     residual = _residual(rig.project(samples.values(control_points)), linear)
-    return Fit(curve, samples, linear.offsets, residual, *equations.outcome(samples))
+    return Fit(curve, samples, linear.offsets, residual, equations.covariance(samples))
 
 
 def observe(
@@ -122,7 +120,7 @@ def observe(
     equations = linear.equations(_Reference.of(samples, curve), levels, config, robust=True)
     equations.solve()
     residual = _residual([view.pixels for view in linear.views], linear)
-    return Fit(curve, samples, linear.offsets, residual, *equations.outcome(samples))
+    return Fit(curve, samples, linear.offsets, residual, equations.covariance(samples))
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +174,6 @@ class _Linearized:
         equations = _Equations(int(self.samples.first[-1]) + spline.ORDER)
         self._add_prediction(equations, reference, config)
         self._add_shape(equations, reference, config)
-        equations.blind = equations.band.copy()
         for view, found, level in zip(self.views, self.offsets, levels, strict=True):
             weight = self._amount(view) / config.noise_px**2
             weight = weight * found.found * np.clip(found.response / level, 0, 1) ** 2
@@ -234,8 +231,6 @@ class _Equations:
     def __init__(self, count: int) -> None:
         self.band = np.zeros((3 * count, spline.BANDWIDTH))
         self.gradient = np.zeros(3 * count)
-        self.blind = self.band
-        """The band as it would be without images."""
 
     def add_scalar(
         self, samples: Samples, times: int, row: Float64, weight: Float64, goal: Float64
@@ -253,14 +248,10 @@ class _Equations:
         spline.factorize(self.band)
         return spline.solve_factorized(self.band, self.gradient).reshape(-1, 3)
 
-    def outcome(self, samples: Samples) -> tuple[Float64, Float64]:
-        """After `solve`: covariance of the samples, and gain of the control points."""
+    def covariance(self, samples: Samples) -> Float64:
+        """(k, 3, 3) of the samples, after `solve`."""
         inverse = spline.band_of_inverse(self.band)
-        spline.factorize(self.blind)
-        blind = spline.diagonal_blocks(spline.band_of_inverse(self.blind))
-        kept = np.linalg.solve(blind, spline.diagonal_blocks(inverse))
-        covariance = spline.sample_covariance(samples.first, samples.table[0], inverse)
-        return covariance, np.eye(3) - kept.transpose(0, 2, 1)
+        return spline.sample_covariance(samples.first, samples.table[0], inverse)
 
     def add(self, samples: Samples, times: int, information: Float64, pull: Float64) -> None:
         spline.add_rows(
