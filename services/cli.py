@@ -35,11 +35,12 @@ VERBS = {
     ),
     "inspect": _Verb("services.inspect", "InspectConfig", "tables of a run"),
     "export": _Verb("services.export", "ExportConfig", "the states of a run as JSON lines"),
-    "view": _Verb("services.view", "ViewConfig", "open a run in the Rerun viewer"),
+    "view": _Verb("services.view", "ViewConfig", "a run, or what runs now, in the Rerun viewer"),
     "bench": _Verb("services.bench", "BenchConfig", "accuracy and speed beside references"),
     "source": _Verb("services.source", "SourceConfig", "the process that releases frames", True),
     "segmenter": _Verb(
         "services.segmenter", "SegmenterConfig", "the process that makes ridge fields", True
+    "compare": _Verb("services.compare", "CompareConfig", "several runs side by side"),
     ),
     "tracker": _Verb(
         "services.tracker", "TrackerConfig", "the process that holds the threads", True
