@@ -31,7 +31,7 @@ SETTLE = 3.0
 # Length over which the thread bends under its own weight.
 BENDING_LENGTH = 45.0
 # Length of thread that the tight knot takes up.
-KNOT_TAKES = 14.0
+KNOT_TAKES = 11.0
 TABLE = '<geom type="plane" size="300 300 1"/>'
 
 
@@ -428,9 +428,10 @@ def knot() -> Result:
     """An overhand loop, tightened until it is a point, then moved."""
     link, length = 1.0, 90.0
     t = np.linspace(-2.12, 2.12, 4000)
-    loop = np.c_[3.4 * (t**3 - 3 * t), 3.0 * (t**4 - 4 * t**2), 0.16 * (t**5 - 10 * t)]
-    tails = [np.array([way * 60.0, loop[-1, 1] + 2.0, 0.0]) for way in (-1, 1)]
-    curve = np.r_[tails[:1], loop, tails[1:]]
+    height = np.clip(t**5 - 10 * t, -9.6, 9.6)
+    loop = np.c_[1.9 * (t**3 - 3 * t), 1.7 * (t**4 - 4 * t**2), 0.19 * height]
+    tails = [loop[i] + [way * 60.0, 1.0, 0.0] for i, way in ((0, -1), (-1, 1))]
+    curve = np.r_[[tails[0]], loop, [tails[1]]]
     travelled = np.r_[0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
     s = travelled[-1] / 2 + np.arange(-length / 2, length / 2 + link / 2, link)
     start = np.stack([np.interp(s, travelled, column) for column in curve.T], axis=1)
@@ -456,7 +457,7 @@ def knot() -> Result:
         len(start) - 1: lambda t: pulled[1](t) + back(t) + moved(max(t - 14.0, 0.0)),
     }
     thread = Thread(rest, held, start, radius=0.24, bending_length=14.0)
-    return Result(simulate([thread], seconds=22, step=2.5e-4, friction=0.6))
+    return Result(simulate([thread], seconds=20.5, friction=0.5))
 
 
 MOTIONS: dict[str, Callable[[], Result]] = {

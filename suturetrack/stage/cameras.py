@@ -113,18 +113,21 @@ def choose_viewpoint(
 
 
 def push_out(
-    view: Viewpoint, rig: StereoRig, rest: Float64, away: Float64, margin: float
+    view: Viewpoint, rig: StereoRig, rest: Float64, leaver: Float64, margin: float
 ) -> Viewpoint:
-    """The view moved sideways, so that (N, 3) points at rest just stay inside and `away` is nearest
-    to the border; `away` is the (3,) direction on the table in which something leaves.
+    """The view moved sideways until `leaver` is `margin` outside the images, `rest` staying inside.
+
+    `leaver` is a (2, 3) step of a point on the table, `rest` (N, 3); `margin` as above.
     """
-    step = (view.rotation @ away)[:2]
+    step = (view.rotation @ (leaver[1] - leaver[0]))[:2]
     step, last = np.r_[step / np.linalg.norm(step), 0.0], view
     for shift in np.arange(0.0, 200.0, 0.5):
         moved = Viewpoint(view.rotation, view.translation + shift * step)
         if not _inside(rig, moved.to_camera(rest), margin).all():
             break
         last = moved
+        if not _inside(rig, moved.to_camera(leaver[1:]), -margin).all():
+            break
     return last
 
 

@@ -64,7 +64,7 @@ SCENARIOS = {
     ),
     "crossings": Scenario(
         "a thread that crosses itself and runs beside itself; still at first, then moved",
-        motions=("crossings-b",),
+        motions=("crossings-a", "crossings-b"),
         threads=(ThreadModel(190),),
         starts_at_rest=True,
     ),
@@ -102,5 +102,12 @@ SCENARIOS = {
         starts_at_rest=True,
         top_speed=200.0,
         shutter=0.5,
+    ),
+    "leaves-view": Scenario(
+        "the moving end leaves the images and comes back",
+        motions=("leaves-view",),
+        threads=(ThreadModel(140),),
+        starts_at_rest=True,
+        end_leaves=True,
     ),
 }

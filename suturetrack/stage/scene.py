@@ -206,8 +206,8 @@ class Scene:
         if not scenario.end_leaves:
             return view
         ends = np.array([self._play.centreline("0", t)[-1] for t in np.arange(0, 20, 0.25)])
-        away = ends[np.argmax(np.linalg.norm(ends - ends[0], axis=1))] - ends[0]
-        return push_out(view, self.rig, points, away, _MARGIN)
+        farthest = ends[np.argmax(np.linalg.norm(ends - ends[0], axis=1))]
+        return push_out(view, self.rig, points, np.array([ends[0], farthest]), _MARGIN)
 
     def _set_the_table(self, rng: np.random.Generator, texture: Float32) -> list[Painter]:
         start = self._play.centreline("0", 0.0)
