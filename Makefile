@@ -27,7 +27,10 @@ test-long: setup
 	$(BIN)/pytest -m long
 
 bench: setup
-	$(BIN)/suturetrack bench
+	$(BIN)/suturetrack bench segmentation
+	$(BIN)/suturetrack bench initialization --seeds 3
+	$(BIN)/suturetrack bench tracking --seeds 3
+	$(BIN)/suturetrack bench latency
 
 clean:
 	rm -rf .venv

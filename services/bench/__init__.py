@@ -9,8 +9,9 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from services.bench import initialization, report, segmentation, tracking
+from services.bench import initialization, latency, report, segmentation, tracking
 from services.bench.initialization import InitializationBench
+from services.bench.latency import LatencyBench
 from services.bench.report import Plot
 from services.bench.segmentation import SegmentationBench
 from services.bench.tracking import TrackingBench
@@ -30,18 +31,22 @@ _PLOTS = {
         Plot("seconds", "data"),
     ),
     "segmentation": (Plot("pair_ms", "filter", logarithmic=True), Plot("f1", "filter")),
+    "latency": (Plot("p50_ms", "process"), Plot("p99_ms", "process")),
 }
 
 
+@tyro.conf.configure(tyro.conf.CascadeSubcommandArgs)
 @dataclass(frozen=True)
 class BenchConfig:
     """Measure accuracy and speed, each figure beside its reference in the same run."""
 
-    what: (
+    what: Annotated[
         Annotated[TrackingBench, tyro.conf.subcommand("tracking")]
         | Annotated[InitializationBench, tyro.conf.subcommand("initialization")]
         | Annotated[SegmentationBench, tyro.conf.subcommand("segmentation")]
-    )
+        | Annotated[LatencyBench, tyro.conf.subcommand("latency")],
+        tyro.conf.arg(name=""),
+    ]
     """The benchmark."""
     json: Path | None = None
     """Write every row at full precision to this file."""
@@ -60,6 +65,8 @@ def run(config: BenchConfig) -> None:
             name, table = "initialization", [*initialization.run(config.what, console)]
         case SegmentationBench():
             name, table = "segmentation", [*segmentation.run(config.what, console)]
+        case LatencyBench():
+            name, table = "latency", [*latency.run(config.what, console)]
     if config.json is not None:
         report.write_json(config.json, {name: table})
     if config.page is not None:

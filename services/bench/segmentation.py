@@ -15,6 +15,7 @@ from rich.console import Console
 from scipy.spatial import cKDTree
 
 from services.bench import report
+from suturetrack.contrast import SIGMAS
 from suturetrack.segmentation import Channel, SegmentationConfig, Segmenter
 from suturetrack.stage import Scene, open_scene
 from suturetrack.types import Image, InputError, Seed, Stamp, StereoFrame
@@ -115,7 +116,7 @@ def _references() -> dict[str, Callable[[Response], Response]]:
         raise InputError(
             "bench segmentation compares with scikit-image: pip install 'suturetrack[bench]'"
         ) from error
-    sigma = SegmentationConfig().sigmas[:1]
+    sigma = SIGMAS[:1]
     return {
         f"{name} (scikit-image)": partial(getattr(filters, name), sigmas=sigma, black_ridges=True)
         for name in ("frangi", "sato", "meijering")
