@@ -1,12 +1,7 @@
 """Simulates the motions of the synthetic bench top with MuJoCo and stores them in the package.
 
-    .venv/bin/pip install mujoco
-    .venv/bin/python tools/simulate_motions.py [NAME ...]
-
-A thread is a chain of capsules joined by ball joints: inextensible by construction, with bending
-stiffness, a kinked rest shape, gravity, friction and contact with the table and with itself. Lengths
-are mm, masses g, times s. Gravity and stiffness are weaker than a real thread's by one factor, which
-leaves the shapes as they are and allows larger time steps.
+.venv/bin/pip install '.[motions]'
+.venv/bin/python tools/simulate_motions.py [NAME ...]
 """
 
 from __future__ import annotations
@@ -16,182 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import mujoco
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from thread_physics import RATE_HZ, Array, Thread, simulate
+from thread_shapes import crossing_pairs, meander, overhand, tangle
 
-Array = NDArray[np.float64]
 FOLDER = Path(__file__).parents[1] / "suturetrack" / "stage" / "motions"
-RATE_HZ = 30
-GRAVITY = 200.0
-DENSITY = 1.4e-4
-RADIUS = 0.22
-SETTLE = 3.0
-# Length over which the thread bends under its own weight.
-BENDING_LENGTH = 45.0
 # Length of thread that the tight knot takes up.
 KNOT_TAKES = 11.0
-TABLE = '<geom type="plane" size="300 300 1"/>'
-
-
-@dataclass
-class Thread:
-    """One thread, and what holds it."""
-
-    shape: Array
-    """(N + 1, 3) nodes at rest."""
-    held: dict[int, Callable[[float], Array | None]]
-    """Nodes that are held, and where to at time t; None lets go."""
-    start: Array | None = None
-    """(N + 1, 3) nodes at the beginning, where that is not the rest shape."""
-    radius: float = RADIUS
-    damping: float = 0.05
-    bending_length: float = BENDING_LENGTH
-
-
-def meander(
-    rng: np.random.Generator, length: float, link: float, box: tuple[float, float], apart: float
-) -> Array:
-    """(N + 1, 3) a random winding, kinked shape of exact length, that fits the box, centred on it."""
-    count = round(length / link)
-    s = (np.arange(count) + 0.5) * length / count
-    while True:
-        heading = rng.uniform(0, 6) + rng.uniform(1.2, 2.3) * np.sin(
-            2 * np.pi * (s / rng.uniform(70, 140) + rng.uniform())
-        )
-        heading += rng.uniform(0, 0.35) * np.sin(
-            2 * np.pi * (s / rng.uniform(20, 40) + rng.uniform())
-        )
-        rise = rng.uniform(0.2, 0.45) * np.sin(2 * np.pi * (s / rng.uniform(35, 60)))
-        step = np.c_[np.cos(heading) * np.cos(rise), np.sin(heading) * np.cos(rise), np.sin(rise)]
-        nodes = np.r_[np.zeros((1, 3)), np.cumsum(step * length / count, axis=0)]
-        nodes -= (nodes.max(0) + nodes.min(0)) / 2
-        extent = np.ptp(nodes, axis=0)
-        if extent[0] < box[0] and extent[1] < box[1] and separation(nodes[:, :2]) > apart:
-            nodes[:, 2] -= nodes[:, 2].min() - 2 * RADIUS
-            return nodes
-
-
-def separation(nodes: Array, beyond: int = 8) -> float:
-    """Smallest distance of nodes that are not neighbours along the thread."""
-    distance = np.linalg.norm(nodes[:, None] - nodes[None], axis=2)
-    far = np.abs(np.subtract.outer(np.arange(len(nodes)), np.arange(len(nodes)))) > beyond
-    return float(distance[far].min())
-
-
-def _vector(values: Array) -> str:
-    return " ".join(f"{v:.6g}" for v in values)
-
-
-def _chain(name: str, thread: Thread) -> str:
-    """The thread as nested bodies."""
-    links = np.diff(thread.shape, axis=0)
-    length = np.linalg.norm(links, axis=1)
-    bending = DENSITY * GRAVITY * thread.bending_length**3
-    bodies = []
-    for i, link in enumerate(links):
-        offset = thread.shape[i] - thread.shape[i - 1] if i else thread.shape[0]
-        stiffness = bending / length[i]
-        joint = (
-            f'<joint type="ball" stiffness="{stiffness}" damping="{thread.damping * stiffness}"/>'
-            if i
-            else "<freejoint/>"
-        )
-        bodies.append(
-            f'<body name="{name}{i}" pos="{_vector(offset)}">{joint}<geom type="capsule" '
-            f'fromto="0 0 0 {_vector(link)}" size="{thread.radius}" mass="{DENSITY * length[i]}"/>'
-        )
-    bodies.append(f'<site name="{name}end" pos="{_vector(links[-1])}"/>')
-    return "".join(bodies) + "</body>" * len(links)
-
-
-def _holds(name: str, thread: Thread) -> tuple[str, str]:
-    """Mocap bodies and the constraints that tie nodes to them."""
-    bodies, ties = "", ""
-    last = len(thread.shape) - 2
-    for node in thread.held:
-        bodies += (
-            f'<body name="{name}hold{node}" mocap="true" pos="{_vector(thread.shape[node])}"/>'
-        )
-        anchor = thread.shape[node] - thread.shape[min(node, last)]
-        ties += (
-            f'<connect name="{name}tie{node}" body1="{name}{min(node, last)}" '
-            f'body2="{name}hold{node}" anchor="{_vector(anchor)}" solref="0.002 1" '
-            'solimp="0.99 0.999 0.0001"/>'
-        )
-    return bodies, ties
-
-
-def _bend_into_start(model: mujoco.MjModel, data: mujoco.MjData, name: str, thread: Thread) -> None:
-    """Turns every link by the smallest rotation that lays the chain along its start."""
-    rest, start = (np.diff(nodes, axis=0) for nodes in (thread.shape, thread.start))
-    before = Rotation.identity()
-    for i, (old, new) in enumerate(zip(rest, start, strict=True)):
-        axis = np.cross(before.apply(old), new)
-        sine, cosine = np.linalg.norm(axis), before.apply(old) @ new
-        turn = Rotation.from_rotvec(axis / max(sine, 1e-12) * np.arctan2(sine, cosine)) * before
-        joint = model.jnt_qposadr[model.body_jntadr[model.body(f"{name}{i}").id]]
-        if i == 0:
-            data.qpos[joint : joint + 3] = thread.start[0]
-            joint += 3
-        data.qpos[joint : joint + 4] = np.roll((before.inv() * turn).as_quat(), 1)
-        before = turn
-
-
-def simulate(
-    threads: list[Thread],
-    seconds: float,
-    step: float = 5e-4,
-    friction: float = 0.3,
-    table: str = TABLE,
-    rate_hz: int = RATE_HZ,
-) -> list[Array]:
-    """(T, N + 1, 3) nodes over time for each thread, `rate_hz` a second, after settling."""
-    names = [chr(ord("a") + i) for i in range(len(threads))]
-    named = list(zip(names, threads, strict=True))
-    holds = [_holds(n, t) for n, t in named]
-    model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><size memory="100M"/><option timestep="{step}" gravity="0 0 -{GRAVITY}" '
-        f'integrator="implicitfast"/><default><geom friction="{friction}" solref="0.01 1"/></default>'
-        f"<worldbody>{table}{''.join(h[0] for h in holds)}{''.join(_chain(n, t) for n, t in named)}"
-        f"</worldbody><equality>{''.join(h[1] for h in holds)}</equality></mujoco>"
-    )
-    data = mujoco.MjData(model)
-    for name, thread in named:
-        if thread.start is not None:
-            _bend_into_start(model, data, name, thread)
-    every = round(1 / rate_hz / step)
-    frames: list[list[Array]] = [[] for _ in threads]
-    for k in range(round((SETTLE + seconds) / step)):
-        time = k * step - SETTLE
-        for name, thread in named:
-            for node, place in thread.held.items():
-                _hold(model, data, f"{name}hold{node}", f"{name}tie{node}", place(max(time, 0.0)))
-        mujoco.mj_step(model, data)
-        if time >= 0 and k % every == 0:
-            for nodes, (name, thread) in zip(frames, named, strict=True):
-                nodes.append(_nodes(data, name, thread, time))
-    return [np.array(nodes) for nodes in frames]
-
-
-def _hold(
-    model: mujoco.MjModel, data: mujoco.MjData, body: str, tie: str, place: Array | None
-) -> None:
-    data.eq_active[model.equality(tie).id] = place is not None
-    if place is not None:
-        data.mocap_pos[model.body(body).mocapid[0]] = place
-
-
-def _nodes(data: mujoco.MjData, name: str, thread: Thread, time: float) -> Array:
-    """(N + 1, 3) nodes; held ones exactly where they are held."""
-    links = [data.body(f"{name}{i}").xpos for i in range(len(thread.shape) - 1)]
-    nodes = np.array([*links, data.site(f"{name}end").xpos])
-    for node, place in thread.held.items():
-        held = place(time)
-        if held is not None:
-            nodes[node] = held
-    return nodes
 
 
 @dataclass
@@ -250,40 +76,6 @@ def crossings(seed: int) -> Result:
     moved = figure8(shape[-1], (9, 4), 10.8)
     held = {0: fixed(shape[0]), len(shape) - 1: lambda t: moved(max(t - 6.0, 0.0))}
     return Result(simulate([Thread(shape, held)], seconds=22))
-
-
-def tangle(rng: np.random.Generator, length: float, link: float, box: tuple[float, float]) -> Array:
-    """(N + 1, 3) a random shape of exact length with crossings and neighbours, each pass on top."""
-    count = round(length / link)
-    s = (np.arange(count) + 0.5) * length / count
-    far = np.abs(np.subtract.outer(np.arange(count + 1), np.arange(count + 1))) > 8
-    while True:
-        heading = rng.uniform(0, 6) + rng.uniform(-1, 1) * 2 * np.pi * s / rng.uniform(60, 120)
-        for wave in (rng.uniform(70, 140), rng.uniform(35, 60)):
-            heading += rng.uniform(0.4, 1.6) * np.sin(2 * np.pi * (s / wave + rng.uniform()))
-        step = np.c_[np.cos(heading), np.sin(heading)] * length / count
-        flat = np.r_[np.zeros((1, 2)), np.cumsum(step, axis=0)]
-        flat -= (flat.max(0) + flat.min(0)) / 2
-        extent = np.ptp(flat, axis=0)
-        tightest = np.abs(np.diff(heading)).max() / (length / count)
-        if extent[0] > box[0] or extent[1] > box[1] or tightest > 1 / 4:
-            continue
-        distance = np.where(far, np.linalg.norm(flat[:, None] - flat[None], axis=2), np.inf)
-        beside = int(((distance > 1.2) & (distance < 3.0)).any(1).sum())
-        if 3 <= len(crossing_pairs(flat)) <= 6 and beside > 14:
-            return np.c_[flat, 0.3 + 0.022 * np.r_[0, s]]
-
-
-def crossing_pairs(flat: Array) -> list[tuple[int, int]]:
-    """Pairs of links of an (N + 1, 2) polyline that cross."""
-    a, d = flat[:-1], np.diff(flat, axis=0)
-    offset = a[None] - a[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        area = d[:, None, 0] * d[None, :, 1] - d[:, None, 1] * d[None, :, 0]
-        t = (offset[..., 0] * d[None, :, 1] - offset[..., 1] * d[None, :, 0]) / area
-        u = (offset[..., 0] * d[:, None, 1] - offset[..., 1] * d[:, None, 0]) / area
-    cross = (t > 0) & (t < 1) & (u > 0) & (u < 1)
-    return [(int(i), int(j)) for i, j in np.argwhere(cross) if j > i + 1]
 
 
 def pull_through() -> Result:
@@ -345,17 +137,12 @@ def grasped() -> Result:
     end = shape[-1]
     away = np.array([np.sign(end[0]) * 45, np.sign(end[1]) * 30, 45.0])
     centre = shape.mean(0)
-    aside = [end + [0, 0, 14], 0.5 * (end + centre) + [0, 10, 20], centre + [0, -12, 14]]
+    lifts = np.array([[0, 0, 14.0], [0, 10, 20.0], [0, -12, 14.0]])
+    aside = list(np.array([end, (end + centre) / 2, centre]) + lifts)
     stops = [(0.0, end + away), (1.0, end + away), (2.5, end), (3.0, end)]
     time, place = 3.0, end
-    for target in [
-        *aside,
-        *aside[::-1],
-        aside[2],
-        aside[0],
-        aside[2],
-        end * [0.8, 0.8, 0] + [0, 0, 3],
-    ]:
+    down = end * [0.8, 0.8, 0] + [0, 0, 3]
+    for target in [*aside, *aside[::-1], aside[2], aside[0], aside[2], down]:
         time += max(1.9 * float(np.linalg.norm(target - place)) / 98.0, 0.3)
         stops.append((time, target))
         time, place = time + 0.5, target
@@ -364,16 +151,18 @@ def grasped() -> Result:
     stops += [(release + 0.5, place), (release + 2.0, place + away), (30.0, place + away)]
     tool = through(stops)
     held = {len(shape) - 1: lambda t: tool(t) if 2.7 <= t < release else None}
-    seconds = 20.0
-    threads = simulate([Thread(shape, held)], seconds=seconds)
+    threads = simulate([Thread(shape, held)], seconds=20.0)
     times = np.arange(len(threads[0])) / RATE_HZ
     opening = np.interp(times, [2.4, 2.7, release, release + 0.3], [4.0, 0.5, 0.5, 4.0])
-    back = away / np.linalg.norm(away)
-    side = np.cross(back, [0, 0, 1.0])
-    side /= np.linalg.norm(side)
     tips = np.array([tool(t) for t in times])
-    spread = 0.5 * opening[:, None] * side
-    return Result(threads, np.stack([tips - spread, tips + spread, tips + 9.0 * back], axis=1))
+    return Result(threads, gripper(tips, opening, away / np.linalg.norm(away)))
+
+
+def gripper(tips: Array, opening: Array, back: Array) -> Array:
+    """(T, 3, 3) tips of the jaws and wrist; `back` is the unit vector from the tips to the wrist."""
+    side = np.cross(back, [0, 0, 1.0])
+    spread = 0.5 * opening[:, None] * side / np.linalg.norm(side)
+    return np.stack([tips - spread, tips + spread, tips + 9.0 * back], axis=1)
 
 
 def fast() -> Result:
@@ -426,36 +215,20 @@ def two_threads() -> Result:
 
 def knot() -> Result:
     """An overhand loop, tightened until it is a point, then moved."""
-    link, length = 1.0, 90.0
-    t = np.linspace(-2.12, 2.12, 4000)
-    height = np.clip(t**5 - 10 * t, -9.6, 9.6)
-    loop = np.c_[1.9 * (t**3 - 3 * t), 1.7 * (t**4 - 4 * t**2), 0.19 * height]
-    tails = [loop[i] + [way * 60.0, 1.0, 0.0] for i, way in ((0, -1), (-1, 1))]
-    curve = np.r_[[tails[0]], loop, [tails[1]]]
-    travelled = np.r_[0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
-    s = travelled[-1] / 2 + np.arange(-length / 2, length / 2 + link / 2, link)
-    start = np.stack([np.interp(s, travelled, column) for column in curve.T], axis=1)
-    start[:, 2] += 1.0 - start[:, 2].min()
-    rest = np.c_[np.arange(len(start)) * link, np.zeros((len(start), 2))]
+    length = 90.0
+    start = overhand(1.0, length)
+    last = len(start) - 1
+    rest = np.outer(np.linspace(0, length, last + 1), [1.0, 0.0, 0.0])
     middle = (start[0] + start[-1]) / 2 * [1, 1, 0] + [0, 0, 2.0]
-    reach = np.array([length - KNOT_TAKES, 0.0, 0.0]) / 2
-    pulled = [
+    reach = np.array([(length - KNOT_TAKES) / 2, 0.0, 0.0])
+    first, second = (
         through([(0.0, e), (3.0, e), (11.0, middle + w * reach), (40.0, middle + w * reach)])
         for w, e in ((-1, start[0]), (1, start[-1]))
-    ]
-    moved = figure8(np.zeros(3), (9, 4), 10.0)
-    back = through(
-        [
-            (0.0, np.zeros(3)),
-            (12.0, np.zeros(3)),
-            (14.0, np.array([-8.0, 4.0, 0.0])),
-            (40.0, np.array([-8.0, 4.0, 0.0])),
-        ]
     )
-    held = {
-        0: pulled[0],
-        len(start) - 1: lambda t: pulled[1](t) + back(t) + moved(max(t - 14.0, 0.0)),
-    }
+    slack = np.array([-8.0, 4.0, 0.0])
+    back = through([(0.0, 0 * slack), (12.0, 0 * slack), (14.0, slack), (40.0, slack)])
+    moved = figure8(np.zeros(3), (9, 4), 10.0)
+    held = {0: first, last: lambda t: second(t) + back(t) + moved(max(t - 14.0, 0.0))}
     thread = Thread(rest, held, start, radius=0.24, bending_length=14.0)
     return Result(simulate([thread], seconds=20.5, friction=0.5))
 
