@@ -194,10 +194,27 @@ def test_the_curve_in_space_and_its_numbers_come_back(
     assert np.allclose(samples["Points3D:positions"], on_curve, atol=1e-4)
     assert len(set(samples["Points3D:colors"].tolist())) > 10
     arrows = row(folder, f"{root}/tangent")["Arrows3D:vectors"]
-    assert np.allclose(
-        arrows.sum(axis=0), curve.control_points[-1] - curve.control_points[0], atol=9
-    )
+    unit = arrows / np.linalg.norm(arrows, axis=1, keepdims=True)
+    assert np.allclose(unit, nurbs.tangents(curve, np.linspace(0, 1, len(arrows))), atol=1e-5)
     assert row(folder, f"{root}/curve")["LineStrips3D:strips"]
+
+
+def test_a_thread_without_a_curve_yet_is_recorded_as_such(
+    tmp_path: Path, distorted_rig: StereoRig, curve: Nurbs
+) -> None:
+    nothing = ThreadState(
+        *(STAMP, "0", Status.LOST, None, np.nan, Energies()),
+        *(np.full(61, np.inf), np.zeros(61, bool)),
+    )
+    with Recorder(tmp_path, "tracker", "light", distorted_rig) as recorder:
+        recorder.states([nothing], PUBLISHED)
+    folder = RunFolder(tmp_path)
+    (recorded,) = folder.states()
+    assert recorded.state.curve is None
+    assert np.isnan(recorded.state.length)
+    assert len(row(folder, "/rig/left/image/curve")["LineStrips2D:strips"]) == 0
+    assert len(row(folder, "/rig/thread/0/curve")["LineStrips3D:strips"]) == 0
+    assert len(row(folder, "/rig/thread/0/reliability")["Points3D:positions"]) == 0
 
 
 def test_plots_carry_their_units_and_the_log_tells_events(tmp_path: Path, curve: Nurbs) -> None:

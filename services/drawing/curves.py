@@ -30,7 +30,11 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.types import Bool, Float64, Image, Status, ThreadState, Truth
 
+Strip = tuple[Float64, Color]
+"""(k, 3) points of a piece of the curve, and its colour."""
+
 _STATUS_COLORS = {Status.TRACKING: GREEN, Status.OCCLUDED: AMBER, Status.LOST: RED}
+_NONE = np.empty((0, 3))
 _DENSE = 240
 _DASH = 5
 _ARROWS = 24
@@ -39,10 +43,14 @@ _WORST_SIGMA_PX = 3.0
 
 def states(states: Sequence[ThreadState], rig: StereoRig, published_ns: int) -> Iterator[Entry]:
     """The curves: over both images, in space, and as plots."""
-    yield from _overlays(states, rig)
-    for state in states:
-        yield from _in_space(state, rig, published_ns)
+    strips = [_strips(state) for state in states]
+    curves = [state.curve.control_points for state in states if state.curve is not None]
+    yield from _overlays([strip for pieces in strips for strip in pieces], curves, rig)
+    for state, pieces in zip(states, strips, strict=True):
+        yield from _in_space(state, pieces, rig)
         yield from _plots(state, rig)
+        numbers = values("ThreadState", _numbers(state, published_ns))
+        yield f"/rig/thread/{part(state.thread)}/nurbs", numbers
 
 
 def truth(truth: Truth) -> Iterator[Entry]:
@@ -70,53 +78,42 @@ def thread_style(thread: str) -> Iterator[Entry]:
     yield f"{plots}/status", rr.StateConfiguration(values=statuses, colors=colors)
 
 
-def _overlays(states: Sequence[ThreadState], rig: StereoRig) -> Iterator[Entry]:
-    strips: dict[str, list[Float64]] = {view: [] for view in VIEWS}
-    points: dict[str, list[Float64]] = {view: [] for view in VIEWS}
-    colors: list[Color] = []
-    for state in states:
-        for strip, color in _strips(state):
-            colors.append(color)
-            for view, pixels in zip(VIEWS, rig.project_raw(strip), strict=True):
-                strips[view].append(_finite(pixels))
-        if state.curve is not None:
-            for view, pixels in zip(
-                VIEWS, rig.project_raw(state.curve.control_points), strict=True
-            ):
-                points[view].append(_finite(pixels))
-    for view in VIEWS:
+def _overlays(
+    strips: list[Strip], control_points: list[Float64], rig: StereoRig
+) -> Iterator[Entry]:
+    colors, ends = [color for _, color in strips], np.cumsum([len(line) for line, _ in strips])
+    lines = _projected([line for line, _ in strips], rig)
+    points = _projected(control_points, rig)
+    for view, line, dots in zip(VIEWS, lines, points, strict=True):
+        pieces = [_finite(piece) for piece in np.split(line, ends[:-1])] if strips else []
         yield (
             f"/rig/{view}/image/curve",
-            rr.LineStrips2D(strips[view], colors=colors, radii=-1.5),
-            rr.Points2D(np.concatenate([np.empty((0, 2)), *points[view]]), colors=RED, radii=-3.0),
+            rr.LineStrips2D(pieces, colors=colors, radii=-1.5),
+            rr.Points2D(_finite(dots), colors=RED, radii=-3.0),
         )
 
 
-def _in_space(state: ThreadState, rig: StereoRig, published_ns: int) -> Iterator[Entry]:
+def _projected(lines: list[Float64], rig: StereoRig) -> tuple[Float64, Float64]:
+    return rig.project_raw(np.concatenate(lines)) if lines else (_NONE[:, :2], _NONE[:, :2])
+
+
+def _in_space(state: ThreadState, strips: list[Strip], rig: StereoRig) -> Iterator[Entry]:
     root = f"/rig/thread/{part(state.thread)}"
-    strips = _strips(state)
-    control_points = np.empty((0, 3)) if state.curve is None else state.curve.control_points
-    yield (
-        f"{root}/curve",
-        rr.LineStrips3D([s for s, _ in strips], colors=[c for _, c in strips], radii=-2.0),
-    )
+    lines, colors = [line for line, _ in strips], [color for _, color in strips]
+    yield f"{root}/curve", rr.LineStrips3D(lines, colors=colors, radii=-2.0)
+    control_points = samples = origins = arrows = _NONE
+    reliable = np.empty((0, 3), np.uint8)
+    if state.curve is not None:
+        control_points = state.curve.control_points
+        samples = nurbs.evaluate(state.curve, np.linspace(0, 1, len(state.sigma)))
+        reliable = _reliability_colors(state.sigma * rig.focal / samples[:, 2], state.seen)
+        s = np.linspace(0, 1, _ARROWS)
+        origins = nurbs.evaluate(state.curve, s)
+        arrows = nurbs.derivative(state.curve, s) / _ARROWS
     yield f"{root}/control_points", rr.Points3D(control_points, colors=RED, radii=-3.5)
-    yield f"{root}/nurbs", values("ThreadState", _numbers(state, published_ns))
-    if state.curve is None:
-        yield f"{root}/tangent", rr.Arrows3D(vectors=np.empty((0, 3)))
-        yield f"{root}/reliability", rr.Points3D(np.empty((0, 3)))
-        return
-    s = nurbs.evenly_spaced(state.curve, _ARROWS)
-    arrows = nurbs.tangents(state.curve, s) * state.length / _ARROWS
-    yield (
-        f"{root}/tangent",
-        rr.Arrows3D(
-            origins=nurbs.evaluate(state.curve, s), vectors=arrows, colors=WHITE, radii=-0.75
-        ),
-    )
-    samples = nurbs.evaluate(state.curve, np.linspace(0, 1, len(state.sigma)))
-    colors = _reliability_colors(state.sigma * rig.focal / samples[:, 2], state.seen)
-    yield f"{root}/reliability", rr.Points3D(samples, colors=colors, radii=-2.5)
+    tangent = rr.Arrows3D(origins=origins, vectors=arrows, colors=WHITE, radii=-0.75)
+    yield f"{root}/tangent", tangent
+    yield f"{root}/reliability", rr.Points3D(samples, colors=reliable, radii=-2.5)
 
 
 def _plots(state: ThreadState, rig: StereoRig) -> Iterator[Entry]:
@@ -153,7 +150,7 @@ def _numbers(state: ThreadState, published_ns: int) -> dict[str, Any]:
     }
 
 
-def _strips(state: ThreadState) -> list[tuple[Float64, Color]]:
+def _strips(state: ThreadState) -> list[Strip]:
     """The curve in pieces: solid where it is seen, dashed where it is not, gray where it is lost."""
     if state.curve is None:
         return []
@@ -163,7 +160,7 @@ def _strips(state: ThreadState) -> list[tuple[Float64, Color]]:
         return [(piece, GRAY) for piece in _dashes(points)]
     seen = _sampled(state.seen, s)
     edges = [0, *(np.flatnonzero(np.diff(seen)) + 1), _DENSE]
-    strips: list[tuple[Float64, Color]] = []
+    strips: list[Strip] = []
     for start, stop in pairwise(edges):
         piece = points[start : stop + 1]
         if seen[start]:
