@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import logging
 import os
@@ -10,7 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 # Each process keeps to one core: they run side by side, and results do not depend on the machine.
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_ONE_THREAD = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
 for _name in _ONE_THREAD:
     os.environ.setdefault(_name, "1")
 # What is wrong with a video is said once, by us.
@@ -34,13 +41,13 @@ VERBS = {
         "services.reconstruct", "ReconstructConfig", "one stereo pair to one curve, as JSON"
     ),
     "inspect": _Verb("services.inspect", "InspectConfig", "tables of a run"),
+    "compare": _Verb("services.compare", "CompareConfig", "several runs side by side"),
     "export": _Verb("services.export", "ExportConfig", "the states of a run as JSON lines"),
     "view": _Verb("services.view", "ViewConfig", "a run, or what runs now, in the Rerun viewer"),
     "bench": _Verb("services.bench", "BenchConfig", "accuracy and speed beside references"),
     "source": _Verb("services.source", "SourceConfig", "the process that releases frames", True),
     "segmenter": _Verb(
         "services.segmenter", "SegmenterConfig", "the process that makes ridge fields", True
-    "compare": _Verb("services.compare", "CompareConfig", "several runs side by side"),
     ),
     "tracker": _Verb(
         "services.tracker", "TrackerConfig", "the process that holds the threads", True
@@ -58,7 +65,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         known = ", ".join(VERBS)
         print(f"suturetrack: no verb {given[0]!r}; there are {known}", file=sys.stderr)
         sys.exit(2)
-    sys.exit(_run(given[0], VERBS[given[0]], given[1:]))
+    verb = VERBS[given[0]]
+    status = _run(given[0], verb, given[1:])
+    if verb.process:
+        _leave(status)
+    sys.exit(status)
 
 
 def _run(name: str, verb: _Verb, arguments: list[str]) -> int:
@@ -83,6 +94,16 @@ def _run(name: str, verb: _Verb, arguments: list[str]) -> int:
     except KeyboardInterrupt:
         return 130
     return 0
+
+
+def _leave(status: int) -> None:
+    """Exits without the interpreter's teardown, which takes half a second for the compilers' sake.
+
+    All is closed by now; the exit handlers of the C library remove the shared memory.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    ctypes.PyDLL(None).exit(status)
 
 
 def _overview() -> str:

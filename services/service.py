@@ -196,15 +196,18 @@ def _stop_with(parent: int, bus: Bus) -> None:
 @contextmanager
 def _stopped_by_signals(bus: Bus) -> Iterator[None]:
     """SIGINT and SIGTERM end the loops; a step that goes on for too long is interrupted."""
-    ended = threading.Event()
+    ended, overdue = threading.Event(), threading.Event()
 
     def stop() -> None:
         bus.stop.set()
         if not ended.wait(_GRACE_S):
+            overdue.set()
             _thread.interrupt_main()
 
     def handler(number: int, frame: FrameType | None) -> None:
         del number, frame
+        if overdue.is_set():
+            raise KeyboardInterrupt
         # The interrupted loop may hold the lock that `stop` needs.
         threading.Thread(target=stop, daemon=True).start()
 

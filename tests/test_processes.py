@@ -1,0 +1,227 @@
+"""Real processes over real Zenoh."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import psutil
+import pytest
+
+from services import topics
+from services.bus import Bus
+from services.export import ExportConfig
+from services.export import run as export
+from services.run_folder import RunFolder
+from services.service import ServiceConfig
+from services.zenoh_transport import ZenohTransport, local_config
+from suturetrack.calibration import save_calibration
+from suturetrack.stage import open_scene
+from suturetrack.types import Status, ThreadState
+
+FRAMES = 10
+STAGE = ("--source", "stage:figure8-107")
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "services.cli", *map(str, arguments)]
+
+
+@pytest.fixture
+def start(rig_name: str) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts `suturetrack ...`; what still runs at the end is killed."""
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(*arguments: object) -> subprocess.Popen[str]:
+        pipe = subprocess.PIPE
+        process = subprocess.Popen(command(*arguments), stdout=pipe, stderr=pipe, text=True)
+        started.append(process)
+        return process
+
+    yield begin
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def until(condition: Callable[[], object], seconds: float = 30) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+
+
+def sockets() -> list[Path]:
+    return list(Path(os.environ["XDG_RUNTIME_DIR"]).rglob("*.sock"))
+
+
+def children(process: subprocess.Popen[str]) -> dict[str, psutil.Process]:
+    """The processes that a launcher has started, by name."""
+    return {child.cmdline()[3]: child for child in psutil.Process(process.pid).children()}
+
+
+def wait_for_state(rig: str = ServiceConfig.rig) -> ThreadState:
+    """The first state of a rig that a consumer sees."""
+    bus = Bus(ZenohTransport(local_config(rig, "viewer")), rig, "viewer")
+    state = bus.every(topics.STATE).get(60)
+    bus.close()
+    assert state is not None
+    return state
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[float, float]]:
+    """A folder of image pairs with calibration.yaml, and a seed."""
+    folder = tmp_path_factory.mktemp("pairs")
+    scene = open_scene("figure8-107", seed=3)
+    for side in ("left", "right"):
+        (folder / side).mkdir()
+    for i in range(FRAMES):
+        for side, image in zip(("left", "right"), scene.render(i), strict=True):
+            cv2.imwrite(str(folder / side / f"{i:03}.png"), image)
+    save_calibration(folder / "calibration.yaml", scene.rig)
+    return folder, scene.seed_pixel(0)
+
+
+def run_pairs(pairs: tuple[Path, tuple[float, float]], run_dir: Path) -> list[object]:
+    folder, seed = pairs
+    options = ["--source", folder, "--calibration", folder / "calibration.yaml"]
+    return ["run", *options, "--seed", *seed, "--lockstep", "--run-dir", run_dir]
+
+
+def test_a_run_in_lock_step_is_recorded_whole_and_leaves_nothing_behind(
+    start: Callable[..., subprocess.Popen[str]],
+    pairs: tuple[Path, tuple[float, float]],
+    tmp_path: Path,
+) -> None:
+    process = start(*run_pairs(pairs, tmp_path / "a"))
+    out, err = process.communicate(timeout=90)
+    assert process.returncode == 0, err
+    assert "rate Hz" in out
+    assert f"suturetrack view {tmp_path / 'a'}" in out
+    assert not list(Path(os.environ["XDG_RUNTIME_DIR"]).rglob("*.*"))
+    assert (tmp_path / "a" / "config.toml").read_text().count("lockstep = true") == 1
+    original = (pairs[0] / "calibration.yaml").read_bytes()
+    assert (tmp_path / "a" / "calibration.yaml").read_bytes() == original
+    export(ExportConfig(tmp_path / "a", output=tmp_path / "a.jsonl"))
+    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
+    assert [line["frame"] for line in lines] == list(range(FRAMES))
+    assert {line["status"] for line in lines} == {"tracking"}
+    assert [line["capture_time_ns"] for line in lines] == [
+        round(i * 1e9 / 30) for i in range(FRAMES)
+    ]
+
+
+def test_the_source_may_start_first(start: Callable[..., subprocess.Popen[str]]) -> None:
+    """The launcher starts the tracker first; processes that depend on nobody's order do this too."""
+    options = ("--lockstep", "--rig", "test")
+    source = start("source", *STAGE, "--frames", 4, *options)
+    until(lambda: len(sockets()) == 1)
+    others = [start("tracker", *options)]
+    until(lambda: len(sockets()) == 2)
+    others.append(start("segmenter", *options))
+    assert source.wait(60) == 0
+    for process in others:
+        assert process.poll() is None
+        process.terminate()
+        assert process.wait(5) == 0
+
+
+def test_signals_end_each_process_cleanly_and_soon(
+    start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    options = ("--rig", "test", "--run-dir", tmp_path)
+    seed = open_scene("figure8-107").seed_pixel(0)
+    processes = [
+        start("tracker", *options, "--seed", *seed),
+        start("segmenter", *options, "--seed", *seed),
+        start("source", *STAGE, *options),
+    ]
+    wait_for_state("test")
+    for process, number in zip(
+        processes, (signal.SIGTERM, signal.SIGINT, signal.SIGTERM), strict=True
+    ):
+        began = time.monotonic()
+        process.send_signal(number)
+        assert process.wait(10) == 0, process.communicate()[1]
+        assert time.monotonic() - began < 2
+    folder = RunFolder(tmp_path)
+    assert len(folder.files) == 3
+    assert not folder.problems
+    assert folder.states()
+
+
+def test_a_process_that_is_killed_ends_the_run_with_a_clear_line(
+    start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    run = start("run", *STAGE, "--run-dir", tmp_path)
+    wait_for_state()
+    family = children(run)
+    assert set(family) == {"source", "segmenter", "tracker"}
+    family["segmenter"].send_signal(signal.SIGKILL)
+    _, err = run.communicate(timeout=20)
+    assert run.returncode == 1
+    assert "suturetrack run: the segmenter was killed by signal 9" in err
+    assert not any(child.is_running() for child in family.values())
+    assert not sockets()
+    states = [s.state for s in RunFolder(tmp_path).states()]
+    assert states
+    assert {s.status for s in states} <= set(Status)
+
+
+def test_ctrl_c_ends_a_run_with_its_table(
+    start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    run = start("run", *STAGE, "--run-dir", tmp_path)
+    wait_for_state()
+    family = children(run)
+    run.send_signal(signal.SIGINT)
+    out, err = run.communicate(timeout=20)
+    assert run.returncode == 0, err
+    assert "tracking %" in out
+    assert not any(child.is_running() for child in family.values())
+    assert not RunFolder(tmp_path).problems
+
+
+def test_processes_end_when_their_launcher_is_killed(
+    start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    run = start("run", *STAGE, "--run-dir", tmp_path)
+    wait_for_state()
+    family = children(run)
+    run.kill()
+    _, alive = psutil.wait_procs(list(family.values()), timeout=10)
+    assert not alive
+    assert not RunFolder(tmp_path).problems
+
+
+def test_two_runs_at_once_keep_apart_and_a_name_is_used_once(
+    start: Callable[..., subprocess.Popen[str]],
+    pairs: tuple[Path, tuple[float, float]],
+    tmp_path: Path,
+) -> None:
+    first = start("run", *STAGE, "--run-dir", tmp_path / "a", "--rig", "bench")
+    until(lambda: len(sockets()) == 4)
+    refused = start("run", *STAGE, "--run-dir", tmp_path / "b", "--rig", "bench")
+    _, err = refused.communicate(timeout=20)
+    assert refused.returncode == 1
+    assert "rig 'bench' runs already" in err
+    assert not (tmp_path / "b").exists()
+    source = start("source", *STAGE, "--rig", "bench")
+    _, err = source.communicate(timeout=20)
+    assert source.returncode == 1
+    assert "a process named 'source' is running already" in err
+    second = start(*run_pairs(pairs, tmp_path / "c"))
+    _, err = second.communicate(timeout=60)
+    assert second.returncode == 0, err
+    first.terminate()
+    assert first.wait(20) == 0
+    frames = [s.state.stamp.frame for s in RunFolder(tmp_path / "c").states()]
+    assert frames == list(range(FRAMES))
