@@ -18,7 +18,7 @@ from suturetrack.types import Float32, Float64, Image
 
 Int32 = NDArray[np.int32]
 
-_CAPACITY = 1 << 19
+_LEAST_CAPACITY = 1 << 18
 # Standard deviations of the blur at which a strand's coverage is cut off.
 _REACH = 2.6
 
@@ -41,11 +41,12 @@ class Fragments(NamedTuple):
 def make_fragments(size: tuple[int, int]) -> Fragments:
     """Empty fragments for images of `size` (width, height)."""
     width, height = size
+    capacity = max(width * height // 2, _LEAST_CAPACITY)
     return Fragments(
         np.full((height, width), -1, np.int32),
         np.zeros((2, width * height), np.int32),
-        np.zeros((_CAPACITY, 3), np.int32),
-        np.zeros((_CAPACITY, 7), np.float32),
+        np.zeros((capacity, 3), np.int32),
+        np.zeros((capacity, 7), np.float32),
         np.zeros(2, np.int32),
     )
 

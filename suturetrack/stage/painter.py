@@ -15,9 +15,9 @@ from suturetrack.types import Bool, Float32, Float64, Image
 
 # The pixel's own blur: the standard deviation of a box one pixel wide.
 _PIXEL_BLUR = 12**-0.5
-# Penumbra of a shadow, per height over the table.
+# Penumbra of a shadow per height over the table, and the largest as a share of the image's width.
 _PENUMBRA = 0.12
-_LARGEST_PENUMBRA_PX = 4.0
+_LARGEST_PENUMBRA = 1 / 160
 # A gripper's shadow lies over threads that are lower than that, mm.
 _SHADED_HEIGHT = 6.0
 _JAW_RADII, _SHAFT_RADIUS, _SHAFT_LENGTH = (0.55, 1.3), 2.5, 140.0
@@ -52,7 +52,7 @@ def gripper_strands(gripper: Float64) -> list[Strand]:
 
 
 class Painter:
-    """Turns strands into the image of one camera of the rig; reuses its buffers."""
+    """Turns strands into the image of one camera of the rig; `fragments` may be shared by both."""
 
     def __init__(
         self,
@@ -62,12 +62,13 @@ class Painter:
         look: Look,
         background: Float32,
         focus: float,
+        fragments: tubes.Fragments,
     ) -> None:
         self._rig, self._right, self._view, self._look = rig, right, view, look
         self._focus, self._focal = focus, float(rig.left.matrix[0, 0])
         self._background = background
         self._vignette = vignette(rig.image_size, look.vignetting)
-        self._fragments = tubes.make_fragments(rig.image_size)
+        self._fragments = fragments
         width, height = rig.image_size
         self._layer = np.zeros((height, width, 4), np.float32)
 
@@ -135,7 +136,9 @@ class Painter:
         if len(path) < 2:
             return
         penumbra = _PENUMBRA * height[: len(path)] * self._focal / path[:, 2]
-        path[:, 4] = np.minimum(np.hypot(path[:, 4], penumbra), _LARGEST_PENUMBRA_PX)
+        path[:, 4] = np.minimum(
+            np.hypot(path[:, 4], penumbra), _LARGEST_PENUMBRA * self._rig.image_size[0]
+        )
         path[:, 2] = path[:, 2] - _SHADED_HEIGHT if strand.is_tool else 1e9
         dark = Surface((0.0, 0.0, 0.0), 1.0, 0.0, 1.0)
         self._splat(number, path, np.zeros((len(path), 4)), dark, opacity=self._look.shadow)

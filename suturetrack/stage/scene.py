@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from suturetrack.camera import StereoRig
+from suturetrack.kernels import tubes
 from suturetrack.metrics import polyline_length
 from suturetrack.stage import appearance, background, clutter
 from suturetrack.stage.appearance import COLOURS, Look, Picture
@@ -23,7 +24,8 @@ from suturetrack.stage.scenarios import SCENARIOS, Scenario
 from suturetrack.types import Bool, Float32, Float64, Image, InputError, Stamp, Truth
 
 DEFAULT_PICTURE = Picture()
-_SAMPLES_PER_PX = 0.6
+# How finely centrelines are sampled: by the pixel, and never finer than that by the mm.
+_SAMPLES_PER_PX, _MOST_SAMPLES_PER_MM = 0.6, 4.0
 _MARGIN = 0.05
 _HOLE_RADIUS = 0.9
 _MOST_EXPOSURES = 12
@@ -102,7 +104,8 @@ class Scene:
         self.rig, self.fps, self._real_rig = rig, fps, real_rig
         self.frame_count = round(scenario.seconds * fps)
         self._seed, self._scenario = seed, scenario
-        self._play = Play(scenario, rng, _SAMPLES_PER_PX * rig.focal / distances[1])
+        per_mm = min(_SAMPLES_PER_PX * rig.focal / distances[1], _MOST_SAMPLES_PER_MM)
+        self._play = Play(scenario, rng, per_mm)
         self.threads = self._play.threads
         self._view = self._choose_view(rng, distances)
         self._look = Look.draw(rng, picture)
@@ -221,9 +224,12 @@ class Scene:
             strays = clutter.stray_threads(rng, start, self._surfaces["0"], radius)
         views = background.look_at(texture, self._real_rig, self._view, self._look.blur_px)
         focus = float(self._view.to_camera(start)[:, 2].mean())
+        fragments = tubes.make_fragments(self.rig.image_size)
         painters = []
         for right, image in enumerate(views):
-            painter = Painter(self._real_rig, bool(right), self._view, self._look, image, focus)
+            painter = Painter(
+                self._real_rig, bool(right), self._view, self._look, image, focus, fragments
+            )
             if strays:
                 painter.expose(strays, 1.0)
                 painter.bake()
