@@ -225,10 +225,13 @@ def knot() -> Result:
         through([(0.0, e), (3.0, e), (11.0, middle + w * reach), (40.0, middle + w * reach)])
         for w, e in ((-1, start[0]), (1, start[-1]))
     )
-    slack = np.array([-8.0, 4.0, 0.0])
-    back = through([(0.0, 0 * slack), (12.0, 0 * slack), (14.0, slack), (40.0, slack)])
+    slack = np.array([-3.0, 1.5, 0.0])
+    back = through([(0.0, 0 * slack), (16.0, 0 * slack), (18.0, slack), (40.0, slack)])
     moved = figure8(np.zeros(3), (9, 4), 10.0)
-    held = {0: first, last: lambda t: second(t) + back(t) + moved(max(t - 14.0, 0.0))}
+    held = {
+        0: lambda t: first(t) + moved(max(t - 12.0, 0.0)),
+        last: lambda t: second(t) + back(t) + moved(max(t - 12.0, 0.0)),
+    }
     thread = Thread(rest, held, start, radius=0.24, bending_length=14.0)
     return Result(simulate([thread], seconds=20.5, friction=0.5))
 

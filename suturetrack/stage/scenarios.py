@@ -62,6 +62,12 @@ SCENARIOS = {
         threads=(ThreadModel(None),),
         starts_at_rest=True,
     ),
+    "knot": Scenario(
+        "an overhand loop is tightened until it is a point, then moved",
+        motions=("knot",),
+        threads=(ThreadModel(90),),
+        starts_at_rest=True,
+    ),
     "crossings": Scenario(
         "a thread that crosses itself and runs beside itself; still at first, then moved",
         motions=("crossings-a", "crossings-b"),
