@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import cv2
 import numpy as np
 
-from suturetrack.types import Float64, Image, InputError
+from suturetrack.types import Float32, Float64, Image, InputError
+
+Pixels = TypeVar("Pixels", Image, Float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,15 +103,23 @@ class StereoRig:
             for c in (self.left, self.right)
         )
 
-    def rectify(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Both raw images in rectified pixels; the images themselves where nothing is to do."""
+    def rectify(
+        self, left: Pixels, right: Pixels, out: tuple[Pixels | None, Pixels | None] = (None, None)
+    ) -> tuple[Pixels, Pixels]:
+        """Both raw images in rectified pixels; the images themselves where nothing is to do.
+
+        Args:
+            left: (H, W) or (H, W, 3), uint8 or float32.
+            right: as `left`.
+            out: buffers like the images, written to where there is something to do.
+        """
         if self.is_rectified:
             return left, right
-        (l1, l2), (r1, r2) = self._maps
-        return (
-            cv2.remap(left, l1, l2, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-            cv2.remap(right, r1, r2, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-        )
+        rectified = [
+            cv2.remap(image, *maps, cv2.INTER_LINEAR, buffer, cv2.BORDER_REPLICATE)
+            for image, maps, buffer in zip((left, right), self._maps, out, strict=True)
+        ]
+        return rectified[0], rectified[1]
 
     def project(self, points: Float64) -> tuple[Float64, Float64]:
         """(..., 3) points in the rectified left frame -> (..., 2) rectified pixels, left and right."""

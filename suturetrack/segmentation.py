@@ -10,36 +10,47 @@ import cv2
 import numpy as np
 
 from suturetrack.camera import StereoRig
+from suturetrack.contrast import GRAY, SIGMAS, Contrast, contrast_along, contrast_at
 from suturetrack.kernels import ridge
-from suturetrack.types import Float32, Image, InputError, RidgeField, Seed, StereoFrame
+from suturetrack.types import Float32, Float64, Image, InputError, RidgeField, Seed, StereoFrame
 
 Channel = Literal["learned", "gray", "blue", "green", "red"]
 Polarity = Literal["auto", "dark", "bright", "both"]
 
 _WEIGHTS = {
-    "learned": (29, 150, 77),
-    "gray": (29, 150, 77),
-    "blue": (256, 0, 0),
-    "green": (0, 256, 0),
-    "red": (0, 0, 256),
+    "learned": GRAY,
+    "gray": GRAY,
+    "blue": np.array([1.0, 0.0, 0.0]),
+    "green": np.array([0.0, 1.0, 0.0]),
+    "red": np.array([0.0, 0.0, 1.0]),
 }
+_SIGNS = {"auto": (1.0, 1.0), "dark": (1.0, 1.0), "bright": (-1.0, -1.0), "both": (-1.0, 1.0)}
 # Hue by half the angle in degrees: OpenCV's 180 hues for the directions of half a turn.
 _HUES = (2 * np.arange(256) % 180).astype(np.uint8)
-_SIGNS = {"auto": (1.0, 1.0), "dark": (1.0, 1.0), "bright": (-1.0, -1.0), "both": (-1.0, 1.0)}
+# Fields whose buffers are in use at the same time.
+_SLOTS = 4
+# Share of the way that the automatic c, and a learned contrast, go at each step.
+_PULL, _ADAPT = 0.1, 0.2
+# Fewest pixels of a curve from which contrast is learned.
+_FEWEST_PIXELS = 8
+# Least automatic c, grey levels: what a flawless picture's rounding makes.
+_LEAST_C = 1.0
 
 
 @dataclass(frozen=True)
 class SegmentationConfig:
     """How the images are turned into the ridge vector field."""
 
-    sigmas: tuple[float, ...] = (1.2,)
-    """Standard deviations of the Gaussian whose second derivatives are taken, px: about half the
-    thread's width. Of several, the one with the longest vector counts at each pixel."""
+    sigmas: tuple[float, ...] | None = None
+    """Standard deviations of the Gaussian whose second derivatives are taken, px: a third to half of
+    the thread's width. Of several, the one with the longest vector counts at each pixel. None: 1.2
+    until a seed shows how wide the thread is."""
     beta: float = 0.5
     """Beta of eq. (1): how far a ridge may be from straight and endless before it fades."""
     c: float | None = None
     """c of eq. (1), grey levels: the strength S at which a ridge counts by 40 %. None: half the
-    99.8th percentile of S, steadied over time."""
+    99.8th percentile of S until a seed shows the thread's S, then half of that; it follows the
+    brightness of the image."""
     blur: float = 1.2
     """Standard deviation of the Gaussian G of Algorithm 1, px, on a window of 5x5."""
     channel: Channel = "learned"
@@ -50,10 +61,12 @@ class SegmentationConfig:
     shows otherwise."""
 
     def __post_init__(self) -> None:
-        if not self.sigmas or min(self.sigmas) <= 0 or self.blur <= 0 or self.beta <= 0:
+        if not all(sigma > 0 for sigma in (self.beta, self.blur, *(self.sigmas or (1.0,)))):
             raise InputError("segmentation: sigmas, beta and blur must be positive")
-        if self.c is not None and self.c <= 0:
-            raise InputError("segmentation: c must be positive, or None for an automatic value")
+        if self.sigmas == () or (self.c is not None and not self.c > 0):
+            raise InputError(
+                "segmentation: give sigmas and a positive c, or None for automatic ones"
+            )
 
 
 class Segmenter:
@@ -63,10 +76,11 @@ class Segmenter:
     """
 
     def __init__(self, rig: StereoRig, config: SegmentationConfig = SegmentationConfig()) -> None:
-        width, height = rig.image_size
         self._rig = rig
         self._config = config
-        self._weights: Float32 = np.array(_WEIGHTS[config.channel], np.float32) / np.float32(256)
+        self._threads: dict[str, Contrast] = {}
+        self._look = _first_look(config)
+        width, height = rig.image_size
         self._views = _View(height, width, config), _View(height, width, config)
         self._steps = 0
 
@@ -77,24 +91,65 @@ class Segmenter:
             InputError: the images are not uint8, gray or BGR, of the rig's size, and alike.
         """
         self._check(frame)
-        images = self._rig.rectify(frame.left, frame.right)
         slot = self._steps % _SLOTS
         self._steps += 1
-        left, right = (
-            view.segment(image, self._weights, slot)
-            for view, image in zip(self._views, images, strict=True)
+        left, right = self._views
+        left.see(frame.left, self._look)
+        right.see(frame.right, self._look)
+        planes = self._rig.rectify(left.plane, right.plane, out=(left.rectified, right.rectified))
+        return RidgeField(
+            frame.stamp,
+            left.filter(planes[0], self._look, slot),
+            right.filter(planes[1], self._look, slot),
         )
-        return RidgeField(frame.stamp, left, right)
 
     def learn(self, frame: StereoFrame, seed: Seed) -> None:
-        """Learn from the surroundings of `seed` what tells the thread from the background."""
+        """Learn at `seed` what tells its thread from the surroundings: colours, width, contrast.
+
+        A seed with no ridge within 8 px teaches nothing. Of several threads, the mix suits all.
+
+        Raises:
+            InputError: as `step`, or the seed lies outside the left image.
+        """
+        self._check(frame)
+        image = self._rig.rectify(frame.left, frame.right)[0]
+        pixel = self._locate(seed)
+        contrast = contrast_at(image, pixel)
+        if contrast is not None:
+            self._threads[seed.thread] = contrast
+            self._relook(image)
+
+    def adapt(self, frame: StereoFrame, pixels: Float64, thread: str = "0") -> None:
+        """Follow slow changes of the light: go a part of the way to what a held curve shows.
+
+        Args:
+            frame: the frame that the curve belongs to.
+            pixels: (N, 2) raw left pixels along the curve, where the thread is seen.
+            thread: which thread this is; one that was never learned is left alone.
+
+        Raises:
+            InputError: as `step`.
+        """
+        self._check(frame)
+        width, height = self._rig.image_size
+        pixels = self._rig.rectify_pixels(pixels)
+        inside = (pixels >= 0).all(1) & (pixels <= (width - 1, height - 1)).all(1)
+        if thread not in self._threads or np.count_nonzero(inside) < _FEWEST_PIXELS:
+            return
+        old = self._threads[thread]
+        image = self._rig.rectify(frame.left, frame.right)[0]
+        new = contrast_along(image, pixels[inside], old.sigma)
+        if new.across @ old.weights > 0:
+            self._threads[thread] = old.towards(new, _ADAPT)
+            self._relook(image)
 
     def warm_up(self) -> None:
         """Compile (or load) the kernels, so that the first frame is as quick as the next."""
         width, height = self._rig.image_size
         for shape in ((height, width, 3), (height, width)):
-            blank = np.zeros(shape, np.uint8)
-            _View(height, width, self._config).segment(blank, self._weights, 0)
+            view = _View(height, width, self._config)
+            view.see(np.zeros(shape, np.uint8), self._look)
+            view.filter(view.plane, self._look, 0)
 
     def _check(self, frame: StereoFrame) -> None:
         width, height = self._rig.image_size
@@ -109,8 +164,63 @@ class Segmenter:
         if frame.left.ndim != frame.right.ndim:
             raise InputError("one image is gray and the other in colour; both must be alike")
 
+    def _locate(self, seed: Seed) -> tuple[float, float]:
+        if seed.pixel is not None:
+            u, v = self._rig.rectify_pixels(np.array(seed.pixel, float))
+        else:
+            u, v = self._rig.project(np.array(seed.point, float))[0]
+        width, height = self._rig.image_size
+        if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+            raise InputError(
+                f"seed at ({u:.0f}, {v:.0f}) px: outside the left image of {width}x{height}"
+            )
+        return float(u), float(v)
 
-_SLOTS = 4
+    def _relook(self, image: Image) -> None:
+        self._look = _learned_look(self._config, list(self._threads.values()), _brightness(image))
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What is looked for, in both views."""
+
+    weights: Float32
+    """(3,) of blue, green and red, whole 256ths: sums of grey values are exact in float32."""
+    sigmas: tuple[float, ...]
+    signs: tuple[float, float]
+    """See `ridge.ridge_vectors`."""
+    relative_c: float | None
+    """c as a share of the brightness; None until it is learned."""
+
+
+def _first_look(config: SegmentationConfig) -> _Look:
+    weights = _exact(_WEIGHTS[config.channel])
+    return _Look(weights, config.sigmas or SIGMAS[:1], _SIGNS[config.polarity], None)
+
+
+def _learned_look(config: SegmentationConfig, threads: list[Contrast], brightness: float) -> _Look:
+    signs = _SIGNS[config.polarity]
+    if config.channel == "learned":
+        weights = np.mean(
+            [t.weights if len(t.weights) == 3 else t.weights * GRAY for t in threads], 0
+        )
+    else:
+        weights = _WEIGHTS[config.channel]
+    shown = np.array([np.broadcast_to(t.across, 3) for t in threads]) @ weights
+    if config.polarity == "auto" and (shown < 0).any():
+        signs = _SIGNS["bright" if (shown < 0).all() else "both"]
+    elif config.polarity == "bright" and config.channel == "learned":
+        weights = -weights
+    sigmas = config.sigmas or tuple(sorted({t.sigma for t in threads}))
+    return _Look(_exact(weights), sigmas, signs, float(np.abs(shown).min()) / 2 / brightness)
+
+
+def _exact(weights: Float64) -> Float32:
+    return (np.rint(weights / np.abs(weights).sum() * 256) / 256).astype(np.float32)
+
+
+def _brightness(image: Image) -> float:
+    return max(float(image[::16, ::16].mean()), 1.0)
 
 
 class _View:
@@ -118,38 +228,51 @@ class _View:
 
     def __init__(self, height: int, width: int, config: SegmentationConfig) -> None:
         self._config = config
-        self._taps = [gaussian_taps(sigma) for sigma in config.sigmas]
         self._kernel = gaussian_kernel(config.blur)
-        self._plane = np.empty((height, width), np.float32)
         self._channels = [np.empty((height, width), np.uint8) for _ in range(3)]
         self._vectors = np.empty((2, height, width), np.float32)
-        self._strength = np.zeros(((height + 3) // 4, width), np.float32)
+        self._strength = np.empty(((height + 3) // 4, width), np.float32)
         self._outputs = np.empty((_SLOTS, height, width, 2), np.float32)
-        self._c = config.c
+        self._relative_c: float | None = None
+        self._brightness = 1.0
+        self.plane = np.empty((height, width), np.float32)
+        self.rectified = np.empty((height, width), np.float32)
 
-    def segment(self, image: Image, weights: Float32, slot: int) -> Float32:
+    def see(self, image: Image, look: _Look) -> None:
+        """Mix the channels of the raw image into `plane`."""
+        self._brightness = _brightness(image)
         if image.ndim == 2:
-            np.copyto(self._plane, image)
+            np.multiply(image, look.weights.sum(), out=self.plane)
         else:
             cv2.split(image, self._channels)
-            ridge.mix_channels(*self._channels, weights, self._plane)
-        if self._c is None:
-            self._filter(1.0)
-            self._c = self._automatic_c()
-        self._filter(self._c)
-        if self._config.c is None:
-            self._c += _PULL * (self._automatic_c() - self._c)
+            ridge.mix_channels(*self._channels, look.weights, self.plane)
+
+    def filter(self, plane: Float32, look: _Look, slot: int) -> Float32:
+        """Eq. (1) and Algorithm 1 on the rectified plane, into the slot's buffer."""
+        if self._config.c is not None:
+            self._find_ridges(plane, look, self._config.c)
+        elif look.relative_c is not None:
+            self._find_ridges(plane, look, self._brightness * look.relative_c)
+        else:
+            self._find_ridges_by_their_quantile(plane, look)
         ridge.blur_angles(self._vectors, self._kernel, self._outputs[slot])
         return self._outputs[slot]
 
-    def _filter(self, c: float) -> None:
+    def _find_ridges_by_their_quantile(self, plane: Float32, look: _Look) -> None:
+        if self._relative_c is None:
+            self._find_ridges(plane, look, _LEAST_C)
+            self._relative_c = self._automatic_c() / self._brightness
+        self._find_ridges(plane, look, max(self._relative_c * self._brightness, _LEAST_C))
+        self._relative_c += _PULL * (self._automatic_c() / self._brightness - self._relative_c)
+
+    def _find_ridges(self, plane: Float32, look: _Look, c: float) -> None:
         shape = 0.5 / self._config.beta**2, 0.5 / c**2
-        for i, taps in enumerate(self._taps):
+        for i, sigma in enumerate(look.sigmas):
             ridge.ridge_vectors(
-                self._plane,
-                taps,
+                plane,
+                ridge.gaussian_taps(sigma),
                 shape,
-                _SIGNS[self._config.polarity],
+                look.signs,
                 i > 0,
                 self._vectors,
                 self._strength,
@@ -157,28 +280,6 @@ class _View:
 
     def _automatic_c(self) -> float:
         return max(math.sqrt(ridge.quantile(self._strength, 0.998)) / 2, _LEAST_C)
-
-
-_PULL = 0.1
-_LEAST_C = 1.0
-
-
-def gaussian_taps(sigma: float) -> Float32:
-    """(3, r + 1) the right halves, centre first, of a Gaussian and of its first two derivatives.
-
-    The derivatives are those of unit parabolas exactly, multiplied by sigma and sigma^2 so that
-    scales compare. Cut at 3 sigma and filled up with zeros to r, a multiple of 4.
-    """
-    radius = math.ceil(3 * sigma)
-    x = np.arange(-(-radius // 4) * 4 + 1, dtype=float)
-    smooth = np.where(x <= radius, np.exp(-(x**2) / (2 * sigma**2)), 0)
-    smooth /= smooth[0] + 2 * smooth[1:].sum()
-    slope = x * smooth
-    slope *= sigma / (2 * (x * slope).sum())
-    curve = (x**2 / sigma**2 - 1) * smooth
-    curve -= smooth * (curve[0] + 2 * curve[1:].sum())
-    curve *= sigma**2 / (x**2 * curve).sum()
-    return np.array([smooth, slope, curve], np.float32)
 
 
 def gaussian_kernel(sigma: float) -> Float32:
@@ -197,7 +298,21 @@ def direction_image(field_view: Float32) -> Image:
     Returns:
         (H, W, 3) uint8 BGR.
     """
-    length, angle = cv2.cartToPolar(*cv2.split(field_view), angleInDegrees=True)
+    u, v = cv2.split(field_view)
+    length, angle = cv2.cartToPolar(u, v, angleInDegrees=True)
     hue = cv2.LUT(cv2.convertScaleAbs(angle, alpha=0.5), _HUES)
     value = cv2.convertScaleAbs(length, alpha=255)
     return cv2.cvtColor(cv2.merge([hue, np.full_like(hue, 255), value]), cv2.COLOR_HSV2BGR)
+
+
+def direction_key(size: int = 64) -> Image:
+    """The key to `direction_image`: a wheel in which every spoke has the colour of its direction.
+
+    Returns:
+        (size, size, 3) uint8 BGR, black outside the wheel.
+    """
+    axis = np.linspace(-1, 1, size, dtype=np.float32)
+    spokes = np.dstack(np.meshgrid(axis, axis))
+    radius = np.linalg.norm(spokes, axis=-1, keepdims=True)
+    wheel = (radius > 0.25) & (radius <= 1)
+    return direction_image(np.where(wheel, spokes / np.maximum(radius, 0.25), 0).astype(np.float32))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,25 @@ from suturetrack.types import Float32, Image
 _fast = {"fastmath": {"contract", "nnan", "ninf", "nsz", "arcp"}, "error_model": "numpy"}
 _zero, _half, _one, _two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _tiny = np.float32(1e-20)
+
+
+@cache
+def gaussian_taps(sigma: float) -> Float32:
+    """(3, r + 1) the right halves, centre first, of a Gaussian and of its first two derivatives.
+
+    The derivatives are those of unit parabolas exactly, multiplied by sigma and sigma^2 so that
+    scales compare. Cut at 3 sigma and filled up with zeros to r, a multiple of 4.
+    """
+    radius = math.ceil(3 * sigma)
+    x = np.arange(-(-radius // 4) * 4 + 1, dtype=float)
+    smooth = np.where(x <= radius, np.exp(-(x**2) / (2 * sigma**2)), 0)
+    smooth /= smooth[0] + 2 * smooth[1:].sum()
+    slope = x * smooth
+    slope *= sigma / (2 * (x * slope).sum())
+    curve = (x**2 / sigma**2 - 1) * smooth
+    curve -= smooth * (curve[0] + 2 * curve[1:].sum())
+    curve *= sigma**2 / (x**2 * curve).sum()
+    return np.array([smooth, slope, curve], np.float32)
 
 
 @njit(cache=True, **_fast)
@@ -38,8 +58,7 @@ def ridge_vectors(
 
     Args:
         plane: (H, W).
-        taps: (3, r + 1) right half, centre first, of the Gaussian and its first two derivatives;
-            r is a multiple of 4.
+        taps: of `gaussian_taps`.
         shape: (1 / (2 beta^2), 1 / (2 c^2)).
         signs: lambda_2 / |lambda_2| must lie in this closed range: (1, 1) finds dark ridges,
             (-1, -1) bright ones, (-1, 1) both.

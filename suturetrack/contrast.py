@@ -1,0 +1,262 @@
+"""What tells a thread from its surroundings: a mix of the colour channels, and the thread's width.
+
+The second derivatives that eq. (1) looks at are linear in the channels. Across the thread they are
+a vector h, one number a channel; everywhere else they scatter with a covariance C. Then
+w = C^-1 h is Fisher's mix: in no other does the thread stand out more from texture, noise, and the
+highlights that make h itself vary along the thread. In it the thread is dark.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from suturetrack.kernels.ridge import gaussian_taps
+from suturetrack.types import Float64, Image
+
+SIGMAS = (1.2, 2.4, 4.8)
+"""Scales at which a thread is looked for, px."""
+GRAY = np.array([29.0, 150.0, 77.0]) / 256
+"""The usual weights of blue, green and red, in 256ths."""
+
+_WINDOW_PX = 64
+_SNAP_PX = 8
+_STARTS = 4
+_ROUNDS = 2
+_SHORTEST_PX = 20
+# A ridge that stands out less is taken for background: threads have 1.4 to 5, texture up to 1.2.
+_LEAST_SCORE = 1.25
+# Variance of the second derivatives that even a flawless picture is taken to have, grey levels^2.
+_FLOOR = 1.0
+# Second derivative across the edge of a shadow, as a share of the brightness.
+_SHADOW = 0.05
+# A mix that is not better than gray by this factor is not worth its noise.
+_WORTH = 1.1
+
+
+@dataclass(frozen=True, eq=False)
+class Contrast:
+    """How to see a thread."""
+
+    weights: Float64
+    """(channels,) the mix in which the thread is dark; magnitudes add up to 1."""
+    across: Float64
+    """(channels,) second derivative across the thread in its middle, times sigma^2, grey levels:
+    positive where the thread is dark."""
+    sigma: float
+    """Scale that suits the thread's width, px."""
+
+    def towards(self, other: Contrast, share: float) -> Contrast:
+        """The contrast `share` of the way from this one to `other`."""
+        weights = (1 - share) * self.weights + share * other.weights
+        across = (1 - share) * self.across + share * other.across
+        return Contrast(weights / np.abs(weights).sum(), across, self.sigma)
+
+
+def contrast_at(image: Image, pixel: tuple[float, float]) -> Contrast | None:
+    """The contrast of the thread that runs within 8 px of `pixel`; None where nothing does.
+
+    Args:
+        image: (H, W, 3) BGR or (H, W) gray, uint8.
+        pixel: (u, v) in that image.
+    """
+    crop, seed = _window(image, pixel)
+    found = []
+    for sigma in SIGMAS:
+        scene = _Scene.of(crop, sigma)
+        ridges = _ridges_near(scene, seed)
+        scores = [_score(scene, *ridge) for ridge in ridges]
+        if max(scores, default=0.0) >= _LEAST_SCORE:
+            weights, ridge = ridges[int(np.argmax(scores))]
+            found.append((float(np.median(ridge.across(scene) @ weights)), sigma, ridge))
+    if not found:
+        return None
+    # The response is strongest where sigma is half the width; the middle is seen best below that.
+    _, sigma, ridge = max(found, key=lambda f: f[0])
+    return _contrast(_Scene.of(crop, max(SIGMAS[0], 0.6 * sigma)), ridge)
+
+
+def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
+    """The contrast of the thread whose middle runs through `pixels`.
+
+    Args:
+        image: (H, W, 3) BGR or (H, W) gray, uint8.
+        pixels: (N, 2) inside that image, in order along the thread, N >= 8.
+        sigma: scale that suits the thread's width, px.
+    """
+    low = np.maximum(pixels.min(0).astype(int) - _WINDOW_PX // 2, 0)
+    high = pixels.max(0).astype(int) + _WINDOW_PX // 2
+    crop = image[low[1] : high[1], low[0] : high[0]]
+    tangents = np.gradient(pixels, axis=0)
+    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+    normals = tangents[:, ::-1] * (-1, 1)
+    return _contrast(_Scene.of(crop, sigma), _Ridge(pixels - low, normals))
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """Second derivatives of the image around a thread."""
+
+    hessian: Float64
+    """(3, H, W, channels): d2/du2, d2/dudv and d2/dv2 of the smoothed image, times sigma^2."""
+    clutter: Float64
+    """(channels, channels): their covariance."""
+    nuisance: Float64
+    """(channels, channels): the clutter and, whether the image shows one or not, a shadow."""
+    sigma: float
+
+    @classmethod
+    def of(cls, image: Image, sigma: float) -> _Scene:
+        planes = np.atleast_3d(image).astype(np.float64)
+        smooth, slope, curve = gaussian_taps(sigma).astype(np.float64)
+        smooth, curve = np.r_[smooth[:0:-1], smooth], np.r_[curve[:0:-1], curve]
+        slope = np.r_[-slope[:0:-1], slope]
+        hessian = np.array(
+            [
+                cv2.sepFilter2D(planes, cv2.CV_64F, *taps, borderType=cv2.BORDER_REPLICATE)
+                for taps in ((curve, smooth), (slope, slope), (smooth, curve))
+            ]
+        ).reshape(3, *planes.shape)
+        uu, uv, vv = hessian.reshape(3, -1, planes.shape[2])
+        clutter = (uu.T @ uu + 2 * uv.T @ uv + vv.T @ vv) / (2 * len(uu))
+        clutter += _FLOOR * np.eye(len(clutter))
+        shadow = _SHADOW * planes.mean((0, 1))
+        return cls(hessian, clutter, clutter + np.outer(shadow, shadow), sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ridge:
+    """Pixels in the middle of a ridge."""
+
+    pixels: Float64
+    """(N, 2)."""
+    normals: Float64
+    """(N, 2), unit."""
+
+    def across(self, scene: _Scene, offset: float = 0.0) -> Float64:
+        """(N, channels) second derivative along the normal, `offset` px beside the middle."""
+        height, width = scene.hessian.shape[1:3]
+        at = np.rint(self.pixels + offset * self.normals).astype(int)
+        u, v = np.clip(at, 0, (width - 1, height - 1)).T
+        uu, uv, vv = scene.hessian[:, v, u]
+        nu, nv = self.normals[:, :1], self.normals[:, 1:]
+        return nu * nu * uu + 2 * nu * nv * uv + nv * nv * vv
+
+
+def _window(image: Image, pixel: tuple[float, float]) -> tuple[Image, Float64]:
+    left, top = (max(round(x) - _WINDOW_PX, 0) for x in pixel)
+    crop = image[top : round(pixel[1]) + _WINDOW_PX, left : round(pixel[0]) + _WINDOW_PX]
+    return crop, np.array(pixel) - (left, top)
+
+
+def _starts(scene: _Scene, seed: Float64) -> list[tuple[int, int]]:
+    """(v, u) of pixels near the seed whose second derivatives are least like the nuisance."""
+    height, width = scene.hessian.shape[1:3]
+    v, u = (
+        np.mgrid[-_SNAP_PX : _SNAP_PX + 1, -_SNAP_PX : _SNAP_PX + 1]
+        + np.rint(seed[::-1]).astype(int)[:, None, None]
+    )
+    near = (np.hypot(u - seed[0], v - seed[1]) <= _SNAP_PX) & (u >= 0) & (v >= 0)
+    near &= (u < width) & (v < height)
+    v, u = v[near], u[near]
+    unlike = _most_unlike(scene, v, u)[0]
+    unlike *= np.exp(-((u - seed[0]) ** 2 + (v - seed[1]) ** 2) / _SNAP_PX**2)
+    starts = []
+    for _ in range(_STARTS):
+        best = int(np.argmax(unlike))
+        starts.append((int(v[best]), int(u[best])))
+        unlike[np.hypot(u - u[best], v - v[best]) <= 2] = 0
+    return starts
+
+
+def _most_unlike(scene: _Scene, v: Float64, u: Float64) -> tuple[Float64, Float64]:
+    """(N,) how unlike the nuisance pixels are, and (N, channels) second derivatives that show it."""
+    theta = (np.arange(16) * math.pi / 16)[:, None, None]
+    uu, uv, vv = scene.hessian[:, v, u]
+    across = np.cos(theta) ** 2 * uu + np.sin(2 * theta) * uv + np.sin(theta) ** 2 * vv
+    unlike = np.einsum("anc,cd,and->an", across, np.linalg.inv(scene.nuisance), across)
+    best = unlike.argmax(0), np.arange(unlike.shape[1])
+    return unlike[best], across[best]
+
+
+def _ridges_near(scene: _Scene, seed: Float64) -> list[tuple[Float64, _Ridge]]:
+    """Ridges near the seed, each with the mix that suits it."""
+    ridges: list[tuple[Float64, _Ridge]] = []
+    for start in _starts(scene, seed):
+        offsets = [ridge.pixels - start[::-1] for _, ridge in ridges]
+        if not any((np.abs(offset).max(1) <= 1).any() for offset in offsets):
+            followed = _follow(scene, start)
+            if followed is not None:
+                ridges.append(followed)
+    return ridges
+
+
+def _follow(scene: _Scene, start: tuple[int, int]) -> tuple[Float64, _Ridge] | None:
+    """The mix that suits the ridge through `start`, and the ridge as that mix shows it."""
+    weights = _fisher(scene.nuisance, _most_unlike(scene, *np.array(start)[:, None])[1])
+    ridge = _dark_ridge(scene, weights, start)
+    for _ in range(_ROUNDS):
+        if ridge is None:
+            return None
+        weights = _fisher(scene.nuisance, ridge.across(scene))
+        ridge = _dark_ridge(scene, weights, start)
+    return None if ridge is None else (weights, ridge)
+
+
+def _fisher(nuisance: Float64, across: Float64) -> Float64:
+    scatter = np.atleast_2d(np.cov(across.T)) if len(across) > 1 else 0.0
+    weights = np.linalg.solve(nuisance + scatter, np.median(across, axis=0))
+    return weights / np.abs(weights).sum()
+
+
+def _score(scene: _Scene, weights: Float64, ridge: _Ridge) -> float:
+    """How far the ridge stands out; not above 0 for the rim of a stronger ridge of other sign."""
+    middle = float(np.median(ridge.across(scene) @ weights))
+    offsets = scene.sigma * np.array([-3, -2.5, -2, -1.5, 1.5, 2, 2.5, 3])
+    rim = max(-float(np.median(ridge.across(scene, k) @ weights)) for k in offsets)
+    return (middle - max(rim, 0.0)) / math.sqrt(weights @ scene.nuisance @ weights)
+
+
+def _contrast(scene: _Scene, ridge: _Ridge) -> Contrast:
+    across = ridge.across(scene)
+    middle = np.median(across, axis=0)
+    weights = _fisher(scene.clutter, across)
+    if len(weights) == 3:
+        total = scene.clutter + np.cov(across.T)
+        gray = GRAY * np.sign(middle @ GRAY)
+        shown = [middle @ w / math.sqrt(w @ total @ w) for w in (weights, gray)]
+        if shown[0] < _WORTH * shown[1]:
+            weights = gray
+    return Contrast(weights, middle, scene.sigma)
+
+
+def _dark_ridge(scene: _Scene, weights: Float64, start: tuple[int, int]) -> _Ridge | None:
+    """The middle of the dark ridge that passes within 2 px of `start` in a mix."""
+    uu, uv, vv = scene.hessian @ weights
+    height, width = uu.shape
+    trace, root = uu + vv, np.sqrt((uu - vv) ** 2 + 4 * uv**2)
+    lambda_2 = (trace + root) / 2
+    around = tuple(slice(max(x - 2, 0), x + 3) for x in start)
+    least = 0.4 * lambda_2[around].max()
+    v, u = np.nonzero((lambda_2 > max(least, 0)) & (2 * np.abs(trace - root) < trace + root))
+    angle = 0.5 * np.arctan2(2 * uv[v, u], uu[v, u] - vv[v, u])
+    normals = np.stack([np.cos(angle), np.sin(angle)], 1)
+    du, dv = np.rint(normals).astype(int).T
+    beside = [
+        lambda_2[np.clip(v + s * dv, 0, height - 1), np.clip(u + s * du, 0, width - 1)]
+        for s in (-1, 1)
+    ]
+    crest = np.all(beside <= lambda_2[v, u], axis=0)
+    v, u, normals = v[crest], u[crest], normals[crest]
+    shown = np.zeros((height, width), np.uint8)
+    shown[v, u] = 1
+    labels = cv2.connectedComponents(shown, connectivity=8)[1]
+    best = np.argmax(np.where(labels[around], lambda_2[around], -np.inf))
+    label = labels[around].flat[best]
+    ours = labels[v, u] == label
+    if label == 0 or np.count_nonzero(ours) < _SHORTEST_PX:
+        return None
+    return _Ridge(np.stack([u, v], 1)[ours].astype(float), normals[ours])
