@@ -55,21 +55,29 @@ VERBS = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs one verb; the exit status is 0, 1 for input that is at fault, 2 for a wrong call."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if not given or given[0] in ("-h", "--help"):
-        print(_overview())
-        return
-    if given[0] not in VERBS:
-        known = ", ".join(VERBS)
-        print(f"suturetrack: no verb {given[0]!r}; there are {known}", file=sys.stderr)
-        sys.exit(2)
-    verb = VERBS[given[0]]
-    status = _run(given[0], verb, given[1:])
-    if verb.process:
+def main() -> None:
+    """The command `suturetrack`."""
+    arguments = sys.argv[1:]
+    status = call(arguments)
+    if arguments and arguments[0] in VERBS and VERBS[arguments[0]].process:
         _leave(status)
     sys.exit(status)
+
+
+def call(arguments: Sequence[str]) -> int:
+    """Runs one verb; the exit status is 0, 1 for input that is at fault, 2 for a wrong call.
+
+    Raises:
+        SystemExit: for --help, and for options that do not exist or do not parse.
+    """
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return 0
+    name, *options = arguments
+    if name not in VERBS:
+        print(f"suturetrack: no verb {name!r}; there are {', '.join(VERBS)}", file=sys.stderr)
+        return 2
+    return _run(name, VERBS[name], options)
 
 
 def _run(name: str, verb: _Verb, arguments: list[str]) -> int:

@@ -59,7 +59,7 @@ class RunConfig:
     """U V of a pixel on the thread in the raw left image of the first frame; another pair for every
     further thread. The bench top knows its own."""
     view: bool = False
-    """Open the recording in the Rerun viewer when the run is over."""
+    """Show the run in the Rerun viewer while it goes on."""
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
@@ -73,7 +73,7 @@ class DemoConfig:
     scenario: str = "figure8-175"
     """What happens on the bench top."""
     view: bool = False
-    """Open the recording in the Rerun viewer when the run is over."""
+    """Show the run in the Rerun viewer while it goes on."""
 
 
 def run(config: RunConfig | DemoConfig) -> None:
@@ -99,9 +99,6 @@ def run(config: RunConfig | DemoConfig) -> None:
     for table in monitor.tables():
         console.print(table)
     console.print(f"Open it with: suturetrack view {config.service.run_dir}")
-    if config.view:
-        view = [sys.executable, "-m", "services.cli", "view", str(config.service.run_dir)]
-        subprocess.run(view, check=False)
 
 
 def _resolve(config: RunConfig, rig_name: str) -> tuple[RunConfig, StereoRig]:
@@ -183,6 +180,8 @@ def _watch(config: RunConfig, console: Console, stack: ExitStack) -> Monitor:
     stack.callback(bus.close)
     monitor = Monitor(bus)
     fleet = Fleet(_launches(config), console.print)
+    if config.view:
+        stack.callback(_show(service).terminate)
     try:
         with closing(_glances(monitor, console)) as glances:
             for _ in glances:
@@ -215,6 +214,12 @@ def _glances(monitor: Monitor, console: Console) -> Generator[None]:
             console.print(monitor.line(), soft_wrap=True)
         yield
         time.sleep(_GLANCE_S)
+
+
+def _show(service: ServiceConfig) -> subprocess.Popen[bytes]:
+    """The viewer, in a process that nobody waits for."""
+    options = arguments_of(ServiceConfig(rig=service.rig, zenoh=service.zenoh))
+    return subprocess.Popen([sys.executable, "-m", "services.cli", "view", *options])
 
 
 def _launches(config: RunConfig) -> list[Launch]:

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+
+from services import arguments, cli
+from services.launch import RunConfig
+from services.segmenter import SegmenterConfig
+from services.service import ServiceConfig
+from services.source import SourceConfig
+from services.sources import InputConfig
+from services.tracker import TrackerConfig
+from suturetrack.calibration import save_calibration
+from suturetrack.initialization import InitializationConfig
+from suturetrack.segmentation import SegmentationConfig
+from suturetrack.stage import open_scene
+from suturetrack.tracking import TrackingConfig
+
+STAGE = "stage:figure8-107"
+Call = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str], rig_name: str) -> Call:
+    """Runs a verb in this process; its exit status and what it wrote to stderr."""
+    del rig_name
+
+    def run(*words: object) -> tuple[int, str]:
+        try:
+            status = cli.call([str(word) for word in words])
+        except SystemExit as ended:
+            status = int(ended.code or 0)
+        return status, capsys.readouterr().err
+
+    return run
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    save_calibration(tmp_path / "calibration.yaml", open_scene("figure8-107").rig)
+    return tmp_path / "calibration.yaml"
+
+
+def complaint(answer: tuple[int, str]) -> str:
+    """The one line on stderr of a verb that ended with status 1."""
+    status, err = answer
+    assert status == 1
+    assert err.count("\n") == 1, err
+    return err
+
+
+def test_without_a_verb_all_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.call([]) == 0
+    out = capsys.readouterr().out
+    assert all(f"\n  {verb} " in out for verb in cli.VERBS)
+
+
+def test_an_unknown_verb_gets_the_list(call: Call) -> None:
+    status, err = call("trak")
+    assert status == 2
+    assert "'trak'" in err
+    assert "tracker" in err
+
+
+@pytest.mark.parametrize("verb", ["demo", "run", "source", "segmenter", "tracker"])
+def test_the_options_are_explained(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.call([verb, "--help"])
+    assert ended.value.code == 0
+    out = capsys.readouterr().out
+    assert "--rig" in out
+    assert "Name of the rig; keeps several apart." in out
+
+
+def test_run_without_a_source_is_a_wrong_call(call: Call) -> None:
+    status, err = call("run")
+    assert status == 2
+    assert "--source" in err
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--source", "/nowhere/video.mkv"], "no such file or folder"),
+        (["--source", "a,b,c"], "at most two"),
+        (["--source", "99"], "camera 99"),
+        (["--source", "stage:figure9"], "no scenario 'figure9'; use one of figure8-107"),
+        (["--source", STAGE, "--scene-rig", "microscope"], "bench, endoscope"),
+        (["--source", STAGE, "--scene-seed", "-1"], "seed -1"),
+        (["--source", STAGE, "--fps", "0"], "fps 0"),
+        (["--source", STAGE, "--frames", "0"], "frames 0"),
+        (["--source", STAGE, "--seed", "900", "3"], "outside the 640x480 left image"),
+        (["--source", STAGE, "--rig", "a/b"], "rig 'a/b'"),
+        (["--source", STAGE, "--zenoh", "/nowhere.json5"], "no file /nowhere.json5"),
+        (["--source", STAGE, "--calibration", "/nowhere.yaml"], "no file /nowhere.yaml"),
+    ],
+)
+def test_bad_input_gets_one_clear_line_and_nothing_is_made(
+    call: Call, calibration: Path, tmp_path: Path, options: list[str], reason: str
+) -> None:
+    if "stage:" not in options[1]:
+        options = [*options, "--calibration", str(calibration)]
+    line = complaint(call("run", *options, "--run-dir", tmp_path / "run"))
+    assert line.startswith("suturetrack run: ")
+    assert reason in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_video_needs_a_calibration(call: Call, tmp_path: Path) -> None:
+    assert "--calibration FILE is needed" in complaint(call("run", "--source", tmp_path))
+
+
+def test_what_is_no_video_is_said_so(call: Call, calibration: Path) -> None:
+    line = complaint(call("run", "--source", calibration, "--calibration", calibration))
+    assert "not a video that can be read" in line
+
+
+def test_a_run_folder_is_used_once(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "source.rrd").touch()
+    line = complaint(call("run", "--source", STAGE, "--run-dir", tmp_path))
+    assert "holds a run already; give another --run-dir" in line
+
+
+def test_a_run_folder_that_cannot_be_made(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    line = complaint(call("run", "--source", STAGE, "--run-dir", tmp_path / "file" / "run"))
+    assert "Not a directory" in line
+
+
+def test_a_process_refuses_a_bad_rig_name(call: Call) -> None:
+    assert "rig 'a/b'" in complaint(call("tracker", "--rig", "a/b"))
+
+
+SERVICE = ServiceConfig("lab", Path("/net.json5"), Path("/runs/1"), "full", True, 17)
+CONFIGS: list[Any] = [
+    SourceConfig(InputConfig("a,b", Path("c.yaml"), "mm", 12.5, 40, 3, "endoscope"), SERVICE),
+    SourceConfig(InputConfig("0")),
+    SegmenterConfig(SERVICE, ((1.5, 2.25), (3.0, 4.0)), SegmentationConfig((1.0, 2.0), c=3.5)),
+    TrackerConfig(
+        SERVICE,
+        ((0.1, 1e-7),),
+        TrackingConfig("paper", iterations=5),
+        InitializationConfig(snap_px=4.5),
+    ),
+    TrackerConfig(),
+    RunConfig(InputConfig("x"), ServiceConfig(), ((1.0, 2.0),), True),
+]
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda c: type(c).__name__)
+def test_options_give_back_the_configuration(config: Any) -> None:
+    assert tyro.cli(type(config), args=arguments.arguments_of(config)) == config
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda c: type(c).__name__)
+def test_the_configuration_is_written_with_its_defaults(config: Any, tmp_path: Path) -> None:
+    arguments.write_config(config, tmp_path / "config.toml")
+    written = tomllib.loads((tmp_path / "config.toml").read_text())
+    assert written["service"]["rig"] == config.service.rig
+    assert written["service"]["recording"] == config.service.recording
+    if isinstance(config, TrackerConfig):
+        assert written["tracking"]["method"] == config.tracking.method
+
+
+def test_the_overview_loads_no_heavy_library() -> None:
+    code = "import sys; from services import cli; cli.call([]); print('numpy' in sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.endswith("False\n")
