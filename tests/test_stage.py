@@ -80,9 +80,13 @@ def test_thread_stands_out_of_the_plane(scene: Scene) -> None:
     assert np.ptp(centred @ np.linalg.svd(centred)[2][2]) > 2
 
 
-def test_seed_pixel_is_on_the_thread(scene: Scene) -> None:
-    pixels = scene.rig.project_raw(scene.truth(40)[0].points)[0]
-    assert np.linalg.norm(pixels - scene.seed_pixel(40), axis=1).min() < 1e-9
+def test_seed_pixel_is_on_the_thread_and_clear_of_other_strands() -> None:
+    scene = open_scene("two-threads", 5)
+    lines = {t.thread: scene.rig.project_raw(t.points)[0] for t in scene.truth(40)}
+    for own, other in (("0", "1"), ("1", "0")):
+        seed = scene.seed_pixel(40, own)
+        assert np.linalg.norm(lines[own] - seed, axis=1).min() < 1e-9
+        assert np.linalg.norm(lines[other] - seed, axis=1).min() > 9
 
 
 def test_unknown_names_are_answered_with_the_known_ones() -> None:

@@ -29,6 +29,8 @@ _SAMPLES_PER_PX, _MOST_SAMPLES_PER_MM = 0.6, 4.0
 _MARGIN = 0.05
 _HOLE_RADIUS = 0.9
 _MOST_EXPOSURES = 12
+# How far other strands stay from a seed.
+_CLEAR_PX = 10.0
 
 
 def open_scene(
@@ -131,7 +133,9 @@ class Scene:
         return tuple(truths)
 
     def seed_pixel(self, i: int = 0, thread: str | None = None) -> tuple[float, float]:
-        """(u, v) in the raw left image of frame `i`: the middle of what is seen inside the thread.
+        """(u, v) in the raw left image of frame `i`, on the thread, where a person would click.
+
+        Near the middle of what is seen of the thread, clear of other strands where that is possible.
 
         Raises:
             InputError: there is no such thread.
@@ -139,12 +143,19 @@ class Scene:
         thread = self.threads[0] if thread is None else thread
         if thread not in self.threads:
             raise InputError(f"no thread {thread!r}; use one of {', '.join(self.threads)}")
-        truth = self.truth(i)[self.threads.index(thread)]
-        pixels = self._real_rig.project_raw(truth.points)[0]
-        inner = np.arange(len(pixels) // 5, len(pixels) - len(pixels) // 5)
-        shown = inner[truth.visible[inner]]
-        chosen = shown[len(shown) // 2] if len(shown) else len(pixels) // 2
-        return float(pixels[chosen, 0]), float(pixels[chosen, 1])
+        truths = self.truth(i)
+        pixels = [self._real_rig.project_raw(t.points)[0] for t in truths]
+        own = self.threads.index(thread)
+        strands = np.concatenate([pixels.pop(own), *pixels])
+        visible = truths[own].visible
+        count = len(visible)
+        gap = np.linalg.norm(strands[:count, None] - strands, axis=2)
+        travelled = np.r_[0, np.cumsum(np.linalg.norm(np.diff(strands[:count], axis=0), axis=1))]
+        gap[:, :count][np.abs(np.subtract.outer(travelled, travelled)) < 3 * _CLEAR_PX] = np.inf
+        off_centre = np.abs(np.linspace(-0.5, 0.5, count))
+        crowded = np.maximum(_CLEAR_PX - gap.min(axis=1), 0)
+        chosen = int(np.argmin(off_centre + crowded + 1e3 * ~visible))
+        return float(strands[chosen, 0]), float(strands[chosen, 1])
 
     def render(self, i: int) -> tuple[Image, Image]:
         """The images of frame `i`: (H, W, 3) uint8 BGR, left and right."""
