@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from services.sources import InputConfig, open_input
+from services.sources.footage import Footage
+from suturetrack.calibration import save_calibration
+from suturetrack.camera import StereoRig
+from suturetrack.stage import open_scene
+from suturetrack.types import Image, InputError
+
+COUNT = 6
+WIDTH, HEIGHT = 320, 240
+
+
+def picture(index: int, side: int) -> Image:
+    """A picture that tells its frame and its side even after lossy compression."""
+    image = np.full((HEIGHT, WIDTH, 3), 20 + 30 * index, np.uint8)
+    image[:, :40] = 230 if side else 10
+    return image
+
+
+def told(image: Image) -> tuple[int, int]:
+    """Frame and side of a picture."""
+    return round((float(image[100, 200].mean()) - 20) / 30), int(image[100, 20].mean() > 100)
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    k, d = np.array([[400.0, 0, 160], [0, 400, 120], [0, 0, 1]]), np.zeros(5)
+    translation = np.array([-40.0, 0, 0])
+    rig = StereoRig.from_calibration((WIDTH, HEIGHT), (k, d), (k, d), np.eye(3), translation, 0.001)
+    save_calibration(tmp_path / "calibration.yaml", rig)
+    return tmp_path / "calibration.yaml"
+
+
+def write_video(path: Path, pictures: list[Image], fps: float = 20) -> None:
+    size = pictures[0].shape[1], pictures[0].shape[0]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), fps, size)
+    for image in pictures:
+        writer.write(image)
+    writer.release()
+
+
+def write_folder(folder: Path, suffix: str = "png") -> None:
+    for side, name in enumerate(("left", "right")):
+        (folder / name).mkdir(parents=True)
+        for i in range(COUNT):
+            cv2.imwrite(str(folder / name / f"{i:04}.{suffix}"), picture(i, side))
+
+
+def both(index: int) -> Image:
+    return np.hstack([picture(index, 0), picture(index, 1)])
+
+
+def open_footage(source: object, calibration: Path, fps: float = 30) -> Footage:
+    return open_input(InputConfig(str(source), calibration, fps=fps))[0]
+
+
+@pytest.fixture(params=["folder", "side-by-side", "two videos"])
+def footage(request: pytest.FixtureRequest, tmp_path: Path, calibration: Path) -> Footage:
+    if request.param == "folder":
+        write_folder(tmp_path / "pairs")
+        return open_footage(tmp_path / "pairs", calibration, fps=20)
+    if request.param == "side-by-side":
+        write_video(tmp_path / "both.avi", [both(i) for i in range(COUNT)])
+        return open_footage(tmp_path / "both.avi", calibration)
+    for side, name in enumerate(("left", "right")):
+        write_video(tmp_path / f"{name}.avi", [picture(i, side) for i in range(COUNT)])
+    return open_footage(f"{tmp_path / 'left.avi'},{tmp_path / 'right.avi'}", calibration)
+
+
+def test_frames_come_in_order_with_the_recordings_own_time(footage: Footage) -> None:
+    assert footage.size == (WIDTH, HEIGHT)
+    assert footage.fps == 20
+    assert footage.frame_count == COUNT
+    for i in range(COUNT):
+        exposure = footage.read(i)
+        assert exposure is not None
+        assert told(exposure.left) == (i, 0)
+        assert told(exposure.right) == (i, 1)
+        assert exposure.capture_ns == i * 50_000_000
+    assert footage.read(COUNT) is None
+
+
+def test_frames_can_be_left_out(footage: Footage) -> None:
+    for i in (0, 3, 5):
+        exposure = footage.read(i)
+        assert exposure is not None
+        assert told(exposure.left) == (i, 0)
+    assert footage.read(COUNT + 5) is None
+
+
+def test_the_bench_top_knows_its_rig_its_seed_and_the_truth() -> None:
+    footage, rig = open_input(InputConfig("stage:figure8-175", scene_seed=2, fps=25))
+    scene = open_scene("figure8-175", 2, fps=25)
+    assert rig.baseline == scene.rig.baseline
+    assert footage.seeds == (scene.seed_pixel(0),)
+    exposure = footage.read(3)
+    assert exposure is not None
+    np.testing.assert_array_equal(exposure.left, scene.render(3)[0])
+    assert exposure.truths[0].length == pytest.approx(175, rel=1e-3)
+    assert exposure.capture_ns == 120_000_000
+    assert footage.read(scene.frame_count) is None
+
+
+def read_all(source: object, calibration: Path) -> None:
+    footage = open_footage(source, calibration)
+    for i in range(COUNT):
+        footage.read(i)
+
+
+def refused(source: object, calibration: Path, reason: str) -> None:
+    with pytest.raises(InputError, match=reason) as error:
+        read_all(source, calibration)
+    assert "\n" not in str(error.value)
+
+
+def test_a_folder_that_is_none_of_pairs_is_refused(tmp_path: Path, calibration: Path) -> None:
+    folder = tmp_path / "pairs"
+    folder.mkdir()
+    refused(folder, calibration, "no folder left/; it needs")
+    (folder / "left").mkdir()
+    (folder / "right").mkdir()
+    refused(folder, calibration, "no images in left/ or right/")
+    cv2.imwrite(str(folder / "left" / "0.png"), picture(0, 0))
+    cv2.imwrite(str(folder / "right" / "0.png"), picture(0, 1))
+    cv2.imwrite(str(folder / "right" / "1.png"), picture(0, 1))
+    refused(folder, calibration, "1 images in left/, 2 in right/")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        (np.zeros((HEIGHT, WIDTH), np.uint16), "uint16; convert it to 8 bit"),
+        (np.zeros((HEIGHT, WIDTH), np.uint8), r"is \(240, 320, 3\).*is \(240, 320\)"),
+        (np.zeros((HEIGHT, WIDTH // 2, 3), np.uint8), r"is \(240, 160, 3\)"),
+        (b"no image", "cannot be read"),
+        (b"", "cannot be read"),
+    ],
+    ids=["16 bit", "gray", "narrow", "text", "empty"],
+)
+def test_a_wrong_image_in_the_middle_is_named(
+    tmp_path: Path, calibration: Path, wrong: Image | bytes, reason: str
+) -> None:
+    write_folder(tmp_path / "pairs")
+    path = tmp_path / "pairs" / "right" / "0002.png"
+    if isinstance(wrong, bytes):
+        path.write_bytes(wrong)
+    else:
+        cv2.imwrite(str(path), wrong)
+    refused(tmp_path / "pairs", calibration, rf"0002\.png.*{reason}|{reason}")
+
+
+def test_views_of_another_size_than_the_calibration_are_refused(
+    tmp_path: Path, calibration: Path
+) -> None:
+    write_video(tmp_path / "left.avi", [picture(0, 0)])
+    refused(tmp_path / "left.avi", calibration, "views are 160x240, but calibration .* 320x240")
+
+
+def test_videos_that_do_not_match_are_refused(tmp_path: Path, calibration: Path) -> None:
+    write_video(tmp_path / "a.avi", [picture(0, 0)], fps=20)
+    write_video(tmp_path / "b.avi", [picture(0, 1)], fps=30)
+    write_video(tmp_path / "c.avi", [both(0)], fps=20)
+    refused(f"{tmp_path / 'a.avi'},{tmp_path / 'b.avi'}", calibration, "20 and 30 frames/s")
+    refused(f"{tmp_path / 'a.avi'},{tmp_path / 'c.avi'}", calibration, "the other")
+
+
+def test_a_video_that_is_cut_off_ends_early(tmp_path: Path, calibration: Path) -> None:
+    write_video(tmp_path / "both.avi", [both(i) for i in range(COUNT)])
+    whole = (tmp_path / "both.avi").read_bytes()
+    (tmp_path / "both.avi").write_bytes(whole[: len(whole) // 2])
+    footage = open_footage(tmp_path / "both.avi", calibration)
+    seen = [footage.read(i) is not None for i in range(COUNT)]
+    assert seen[0]
+    assert not seen[-1]
