@@ -27,10 +27,15 @@ class EndStep:
 
     offset_px: float
     """How far beyond the curve's end the thread ends, px along the curve; negative: before it."""
-    offset: float
-    """The same as a part of the curve's length."""
+    pixel: float
+    """Length of a pixel there, as a part of the curve's length."""
     at_border: bool
     """Whether the image's border cuts the thread."""
+
+    @property
+    def offset(self) -> float:
+        """The offset as a part of the curve's length."""
+        return self.offset_px * self.pixel
 
 
 def find_end(
@@ -64,7 +69,7 @@ def find_end(
     if boundary is None:
         return None
     at_border = not inside.all() and boundary > x[-1] - 3
-    return EndStep(boundary, boundary / scale, at_border)
+    return EndStep(boundary, 1 / scale, at_border)
 
 
 def _smooth(profile: Float64) -> Float64:
@@ -98,43 +103,84 @@ def _outer_boundary(x: Float64, mean: Float64, least: Float64) -> float | None:
     return float(x[last] + _STEP_PX * min(max(share, 0.0), 1.0))
 
 
-# How far an end moves along the thread from one field to the next, if it is not hidden at once.
-_DRAWN_IN_PX = 4.0
+# What the length of a thread may change by from one field to the next.
+_DRAWN_PX = 6.0
 _SETTLING_S = 0.3
 _HELD_S = 1.5
+_FORGOTTEN_S = 3.0
 _NS = 1e-9
 
 
 class EndWatch:
-    """Decides from field to field whether an end has moved or is only hidden."""
+    """Decides from field to field whether an end has moved, is hidden, or runs into something else.
 
-    def __init__(self, now_ns: int) -> None:
+    What one end loses and the other gains is the thread sliding along itself. A thread that is
+    suddenly shorter is hidden, one that is suddenly longer than it ever was has met something that
+    looks like it: its length is then held.
+    """
+
+    def __init__(self, length: float, now_ns: int) -> None:
         self._found_ns = now_ns
+        self._last_ns = now_ns
         self._seen_ns = [now_ns, now_ns]
+        self._length = self._longest = length
         self.seen = (True, True)
 
     def moves(
-        self, start: EndStep | None, stop: EndStep | None, now_ns: int
+        self, start: EndStep | None, stop: EndStep | None, length: float, now_ns: int
     ) -> tuple[float, float]:
-        """How far to move both ends outward, as parts of the curve's length.
-
-        An end that vanishes at once, faster than a thread can be drawn in, is hidden: it is held for
-        a while. What one end loses and the other gains is the thread sliding along itself.
-        """
+        """How far to move both ends outward, as parts of the curve's `length`."""
         steps = start, stop
-        growth_px = sum(step.offset_px for step in steps if step)
-        fresh = (now_ns - self._found_ns) * _NS < _SETTLING_S
-        moves, seen = [0.0, 0.0], [False, False]
-        for end, step in enumerate(steps):
-            if step is None:
-                continue
-            seen[end] = step.offset_px > -_DRAWN_IN_PX or growth_px > -_DRAWN_IN_PX
+        offsets = [step.offset if step else 0.0 for step in steps]
+        doubted = self._doubted(steps, offsets, length, now_ns)
+        seen = [end not in doubted for end in (0, 1)]
+        for end in doubted:
+            lacking = self._length / length - 1.0 - offsets[1 - end]
+            step = steps[end]
+            if step is None or len(doubted) == 2:
+                offsets[end] = 0.0
+            else:
+                bound = _DRAWN_PX * step.pixel
+                offsets[end] = min(max(lacking, -bound), bound)
+        for end in (0, 1):
             if seen[end]:
                 self._seen_ns[end] = now_ns
-            if seen[end] or fresh or (now_ns - self._seen_ns[end]) * _NS > _HELD_S:
-                moves[end] = step.offset
         self.seen = seen[0], seen[1]
-        return moves[0], moves[1]
+        if not doubted:
+            self._remember(length * (1.0 + sum(offsets)), steps, now_ns)
+        self._last_ns = now_ns
+        return offsets[0], offsets[1]
+
+    def _doubted(
+        self,
+        steps: tuple[EndStep | None, EndStep | None],
+        offsets: list[float],
+        length: float,
+        now_ns: int,
+    ) -> list[int]:
+        """The ends whose steps do not count."""
+        doubted = [end for end in (0, 1) if steps[end] is None]
+        shown = [step for step in steps if step]
+        if doubted or any(step.at_border for step in shown):
+            return doubted
+        if (now_ns - self._found_ns) * _NS < _SETTLING_S:
+            return []
+        slack = _DRAWN_PX * max(step.pixel for step in shown) * length
+        total = length * (1.0 + sum(offsets))
+        if total > max(self._length, self._longest) + slack:
+            return [int(np.argmax(offsets))]
+        if total < self._length - slack:
+            hidden = [end for end in (0, 1) if offsets[end] <= min(offsets) / 2]
+            return [end for end in hidden if (now_ns - self._seen_ns[end]) * _NS < _HELD_S]
+        return []
+
+    def _remember(
+        self, length: float, steps: tuple[EndStep | None, EndStep | None], now_ns: int
+    ) -> None:
+        self._length = length
+        if not any(step and step.at_border for step in steps):
+            fading = np.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)
+            self._longest = max(length, length + (self._longest - length) * float(fading))
 
 
 def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:

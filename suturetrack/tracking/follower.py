@@ -57,7 +57,9 @@ class Follower:
         now = field.stamp.capture_ns
         curve, _, _ = rearrange(curve, rig)
         levels = measure_levels(curve, field, rig)
-        self.model = Model(curve, Motion.none(), levels, now, now, EndWatch(now))
+        self.model = Model(
+            curve, Motion.none(), levels, now, now, EndWatch(nurbs.length(curve), now)
+        )
 
     def step(self, field: RidgeField, thread: str) -> ThreadState:
         """The thread in the next field."""
@@ -119,7 +121,9 @@ class Follower:
     def _adjust_ends(self, field: RidgeField) -> None:
         model = self.model
         steps = [find_end(model.curve, end, field, self.rig, model.levels) for end in (0, 1)]
-        start, stop = model.ends.moves(steps[0], steps[1], field.stamp.capture_ns)
+        start, stop = model.ends.moves(
+            steps[0], steps[1], nurbs.length(model.curve), field.stamp.capture_ns
+        )
         if start or stop:
             model.curve = _with_ends(model.curve, -start, 1.0 + stop)
 
