@@ -29,6 +29,10 @@ __all__ = [
 ]
 
 
+_LEAST_MATCH = 0.35
+"""Median response of the right view, against the left one, below which it shows another scene."""
+
+
 def initialize(
     field: RidgeField,
     rig: StereoRig,
@@ -47,13 +51,13 @@ def initialize(
     if origin is None:
         raise InitializationError(_nothing_there(candidates, pixel, config), candidates)
     chain, left = grow_thread(ridges[0], origin, pixel, config)
-    matched = match(chain, field.right, rig)
+    matched = match(chain, field.left, field.right, rig)
     right = _right_growth(ridges[1], matched.right, config)
     step = max(1, round(config.step_px))
     marks = np.stack([chain.pixels[::step], matched.right[::step]], axis=1)
     growth = Growth(left, right, marks)
     response = float(np.median(matched.response))
-    if response < config.low or len(chain.pixels) < 4 * step:
+    if response < _LEAST_MATCH or len(chain.pixels) < 4 * step:
         reason = "the right view shows no thread along the epipolar lines of the left one"
         if len(chain.pixels) < 4 * step:
             reason = f"the ridge at the seed is only {len(chain.pixels)} px long"

@@ -28,6 +28,8 @@ with it, and neighbouring samples err alike."""
 _EVIDENCE_STEPS = 3
 _STAY = 0.01
 """Weight, against that of a crest, which keeps samples from sliding along the thread."""
+_UNSEEN = 0.02
+"""Trust in a crest below which a view does not see the thread."""
 _STIFFEST = 1e9
 _END_NOISE_PX = 0.2
 _LARGEST_END_STEP_PX = 2.0
@@ -219,9 +221,15 @@ def _information(samples: Samples) -> list[Float64]:
 
 
 def _stay(samples: Samples) -> Float64:
-    """(k, 3, 3) what keeps the samples from sliding along the thread."""
+    """(k, 3, 3) what keeps the samples from sliding along the thread, and from going anywhere
+    where a view does not see them."""
+    normals = samples.crests[0].normals
+    tangents = np.c_[normals[:, 1], -normals[:, 0]]
+    rows = np.einsum("ki,kij->kj", tangents, samples.jacobians[0])
     image = _image_axes(samples)
-    return _STAY * np.einsum("kij,kil->kjl", image, image)
+    unseen = np.minimum(samples.crests[0].trust, samples.crests[1].trust) < _UNSEEN
+    anywhere = unseen[:, None, None] * np.einsum("kij,kil->kjl", image, image)
+    return _STAY * (rows[:, :, None] * rows[:, None] + anywhere)
 
 
 def _add_ends(band: Float64, gradient: Float64, samples: Samples, noise: float) -> None:

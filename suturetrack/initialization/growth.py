@@ -13,6 +13,9 @@ from suturetrack.initialization.topology import follow, merge_ends
 from suturetrack.kernels import growth as kernel
 from suturetrack.types import Bool, Float32, Float64
 
+_FAINT = 0.4
+"""Strength, against the rest of the thread, below which a last segment is no part of it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Chain:
@@ -45,6 +48,7 @@ def grow_thread(
 ) -> tuple[Chain, ViewGrowth]:
     """Grows by eq. (3) from the seed on segment `origin` and follows the merged segments."""
     entries = follow(origin, merge_ends(ridges, config))
+    entries = _without_faint_ends(ridges, entries, origin)
     on_thread = [e // 2 for e in entries]
     pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
     merges = np.array([(a[-1], b[0]) for a, b in pairwise(pieces)])
@@ -60,6 +64,21 @@ def grow_thread(
     return _join(pieces), view
 
 
+def _without_faint_ends(ridges: Ridges, entries: list[int], origin: int) -> list[int]:
+    """Leaves out segments at either end that are far fainter than the thread: shadows, veins."""
+    strength = {e: ridges.sample(ridges.segments[e // 2]).mean() for e in entries}
+    for _ in (0, 1):
+        while entries[-1] // 2 != origin:
+            rest = entries[:-1]
+            sizes = [len(ridges.segments[e // 2]) for e in rest]
+            level = np.average([strength[e] for e in rest], weights=sizes)
+            if strength[entries[-1]] > _FAINT * level:
+                break
+            entries = rest
+        entries = entries[::-1]
+    return entries
+
+
 def _grow(
     ridges: Ridges, pieces: list[Float64], first: int, seed: Float64, config: InitializationConfig
 ) -> Float32:
@@ -68,7 +87,7 @@ def _grow(
 
     def start(point: Float64, at: float) -> None:
         u, v = np.rint(point).astype(int)
-        kernel.grow(ridges.magnitude, u, v, at, config.rho, config.low, cost)
+        kernel.grow(ridges.magnitude, u, v, at, config.rho, ridges.low, cost)
 
     def value(point: Float64) -> float:
         u, v = np.rint(point).astype(int)
@@ -79,7 +98,7 @@ def _grow(
     ahead = list(pairwise(pieces[first:]))
     behind = [(b[::-1], a[::-1]) for a, b in pairwise(pieces[: first + 1])][::-1]
     for one, other in ahead + behind:
-        bridge = float(np.linalg.norm(other[0] - one[-1])) / config.low**config.rho
+        bridge = float(np.linalg.norm(other[0] - one[-1])) / ridges.low**config.rho
         start(other[0], value(one[-1]) + bridge)
     return cost
 

@@ -9,13 +9,17 @@ import numpy as np
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.growth import Chain
 from suturetrack.kernels import matching as kernel
+from suturetrack.kernels import search
 from suturetrack.types import Float32, Float64
 
-_STATE_PX = 0.5
-_LARGEST_CHANGE = 2
+_STATE_PX = 1.0
+_LARGEST_CHANGE = 1
 """States a sample may differ from the one before."""
-_PENALTY = 0.2
+_PENALTY = 1.6
 """Cost of a state's change, against 1 for a sample without any ridge."""
+
+
+_LEAST_LEVEL = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,20 +29,32 @@ class Match:
     right: Float64
     """(k, 2) pixels."""
     response: Float64
-    """(k,) how much the right view looks like thread there, in [0, 1]."""
+    """(k,) how much the right view looks like thread there: 1 as much as the left one."""
 
 
-def match(chain: Chain, field: Float32, rig: StereoRig) -> Match:
-    """Finds the thread of the left chain in the (H, W, 2) right field along the epipolar lines."""
+def match(chain: Chain, left: Float32, right: Float32, rig: StereoRig) -> Match:
+    """Finds the thread of the left chain in the right view along the epipolar lines.
+
+    Args:
+        chain: the thread in the left view.
+        left: (H, W, 2) left field.
+        right: (H, W, 2) right field.
+        rig: the cameras.
+    """
     offset = rig.left.projection[0, 2] - rig.right.projection[0, 2]
     first = min(offset, 0.0)
-    count = int((field.shape[1] - first) / _STATE_PX)
+    count = int((right.shape[1] - first) / _STATE_PX)
     tangents = chain_tangents(chain.pixels)
-    costs = kernel.matching_costs(field, chain.pixels, tangents, first, _STATE_PX, count)
+    level = float(np.median(search.responses(left, chain.pixels, tangents)))
+    costs = kernel.matching_costs(
+        right, chain.pixels, tangents, first, _STATE_PX, count, max(level, _LEAST_LEVEL)
+    )
     states, _ = kernel.cheapest_path(costs, _LARGEST_CHANGE, _PENALTY)
     disparity = first + _STATE_PX * states
-    right = chain.pixels - np.c_[disparity, np.zeros(len(disparity))]
-    return Match(right, 1.0 - costs[np.arange(len(states)), states].astype(float))
+    pixels = chain.pixels - np.c_[disparity, np.zeros(len(disparity))]
+    inside = (pixels[:, 0] >= 0) & (pixels[:, 0] <= right.shape[1] - 1)
+    response = 1.0 - costs[np.arange(len(states)), states].astype(float)
+    return Match(pixels, np.where(inside, response, 0.0))
 
 
 def chain_tangents(pixels: Float64, reach: int = 3) -> Float64:

@@ -7,17 +7,22 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.kernels import crest
 from suturetrack.types import Float32, Float64
 
+ARM = 14
+"""Points of a segment that tell where it is heading."""
 _SHORTEST = 4
 """Points; what is shorter says nothing about direction."""
-_DIRECTION_REACH = 7
-"""Points from an end over which its direction is taken."""
-_END_REACH = 15
-"""Points from an end over which its strength is taken."""
+_NEAR_PX = 6.0
+"""How near an end comes to the side of the segment that it runs into."""
+_GLANCING = 0.7
+"""Cosine of the angle below which an end runs into the side of a segment rather than along it."""
+_NOISE_QUANTILE = 0.9
+_ABOVE_NOISE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +35,8 @@ class Ridges:
     """(H, W) ||V||."""
     segments: tuple[Float64, ...]
     """Each (k, 2) pixels."""
+    low: float
+    """||V|| below which a pixel is background."""
 
     def sample(self, pixels: Float64) -> Float64:
         """(k,) ||V|| at (k, 2) pixels, bilinear, 0 outside."""
@@ -40,44 +47,59 @@ class Ridges:
 def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
     """Crest lines of an (H, W, 2) field, split at junctions; weak and tiny ones are left out."""
     magnitude = cv2.magnitude(field[..., 0], field[..., 1])
-    mask = crest.crest_pixels(field, magnitude, config.low)
+    background = float(np.quantile(magnitude[::4, ::4], _NOISE_QUANTILE))
+    low = float(np.clip(_ABOVE_NOISE * background, config.low / 4, config.low))
+    mask = crest.crest_pixels(field, magnitude, low)
     crest.thin(mask, magnitude)
     pixels, starts = crest.trace_chains(mask)
     if len(pixels) == 0:
-        return Ridges(field, magnitude, ())
+        return Ridges(field, magnitude, (), low)
     refined = _sub_pixel(field, magnitude, pixels)
     strength = magnitude[pixels[:, 1], pixels[:, 0]]
     segments = tuple(
         refined[a:b]
         for a, b in pairwise(starts)
-        if b - a >= _SHORTEST and strength[a:b].max() >= config.high
+        if b - a >= _SHORTEST and (b - a >= ARM or strength[a:b].max() >= config.high)
     )
-    return Ridges(field, magnitude, segments)
+    return Ridges(field, magnitude, split_at_touches(segments), low)
 
 
-@dataclass(frozen=True, eq=False)
-class Ends:
-    """The ends of all segments: end 2i is the start of segment i, 2i + 1 its end."""
+def split_at_touches(segments: tuple[Float64, ...]) -> tuple[Float64, ...]:
+    """Cuts segments where the end of another runs into them at a small angle, so that what two
+    strands share becomes a segment of its own."""
+    if not segments:
+        return ()
+    points = np.concatenate(segments)
+    owner = np.repeat(np.arange(len(segments)), [len(s) for s in segments])
+    index = np.concatenate([np.arange(len(s)) for s in segments])
+    tree = cKDTree(points)
+    cuts: dict[int, set[int]] = {}
+    for k, segment in enumerate(segments):
+        for arm, at in ((segment[:ARM], 0), (segment[::-1][:ARM], len(segment) - 1)):
+            heading = arm[0] - arm[-1]
+            heading = heading / max(float(np.linalg.norm(heading)), 1e-9)
+            near = np.array(tree.query_ball_point(arm[0] + 2 * heading, _NEAR_PX), dtype=int)
+            apart = (owner[near] != k) | (abs(index[near] - at) > 2 * ARM)
+            near = near[apart]
+            if len(near) == 0:
+                continue
+            hit = near[np.argmin(np.linalg.norm(points[near] - arm[0], axis=1))]
+            other, i = segments[owner[hit]], int(index[hit])
+            if min(i, len(other) - 1 - i) < _NEAR_PX:
+                continue
+            along = other[min(i + 4, len(other) - 1)] - other[max(i - 4, 0)]
+            if abs(along @ heading) > _GLANCING * np.linalg.norm(along):
+                cuts.setdefault(int(owner[hit]), set()).add(i)
+    return tuple(
+        piece
+        for k, s in enumerate(segments)
+        for piece in np.split(s, _apart(sorted(cuts.get(k, ()))))
+        if len(piece) >= _SHORTEST
+    )
 
-    positions: Float64
-    """(2n, 2) pixels."""
-    outward: Float64
-    """(2n, 2) unit vectors out of the segments."""
-    strengths: Float64
-    """(2n,) mean ||V|| of the last stretch."""
 
-
-def find_ends(ridges: Ridges) -> Ends:
-    """The ends of the segments, in order."""
-    pieces = [
-        piece for s in ridges.segments for piece in (s[:_END_REACH], s[: -_END_REACH - 1 : -1])
-    ]
-    positions = np.array([p[0] for p in pieces]).reshape(-1, 2)
-    inside = np.array([p[min(_DIRECTION_REACH, len(p)) - 1] for p in pieces]).reshape(-1, 2)
-    outward = positions - inside
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-    strengths = np.array([ridges.sample(p[len(p) // 4 :]).mean() for p in pieces])
-    return Ends(positions, outward, strengths)
+def _apart(cuts: list[int]) -> list[int]:
+    return [c for i, c in enumerate(cuts) if i == 0 or c - cuts[i - 1] > _NEAR_PX]
 
 
 def _sub_pixel(field: Float32, magnitude: Float32, pixels: Float64) -> Float64:

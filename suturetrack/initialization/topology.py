@@ -2,34 +2,56 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from suturetrack.initialization.model import InitializationConfig
-from suturetrack.initialization.segments import Ends, Ridges, find_ends
+from suturetrack.initialization.segments import ARM, Ridges
+from suturetrack.kernels import search
 from suturetrack.types import Bool, Float64
 
+Int64 = NDArray[np.int64]
+
+_CLEAR = 2
+"""Points at the very end of a segment that the other ridges of a junction have drawn aside."""
 _TOUCHING_PX = 6.0
 """Ends this near over ridge belong together at any angle: a sharp bend."""
+_BRIDGE_SAMPLES = 12
+_SWING = 0.01
+"""Price of a bridge that bends one way and then the other."""
+_FREE_END = 0.5
+"""Price of an end without a partner: two of them make the highest price of a merge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Merge:
+    """What joining pairs of ends would cost; end 2i is the start of segment i, 2i + 1 its end."""
+
+    pairs: Int64
+    """(m, 2)."""
+    cost: Float64
+    """(m,) 1 is the highest price that is paid."""
+    touching: Bool
+    """(m,) whether ridge joins the two ends, whatever their angle."""
 
 
 def merge_ends(ridges: Ridges, config: InitializationConfig) -> dict[int, int]:
-    """Pairs up the ends that match best; end 2i is the start of segment i, 2i + 1 its end."""
+    """Pairs up the ends so that all merges and free ends together cost least (almost: by exchange)."""
     if not ridges.segments:
         return {}
-    ends = find_ends(ridges)
-    pairs = cKDTree(ends.positions).query_pairs(config.gap_px, output_type="ndarray")
-    pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
-    if len(pairs) == 0:
-        return {}
-    cost, touching = _merge_costs(ridges, ends, pairs, config)
+    merges = price_merges(ridges, config)
+    price = {
+        (int(i), int(j)): float(c) for (i, j), c in zip(merges.pairs, merges.cost, strict=True)
+    }
+    price |= {(j, i): c for (i, j), c in price.items()}
     partner: dict[int, int] = {}
-    for wanted in (cost < 1, touching):
-        for k in np.argsort(cost):
-            i, j = (int(e) for e in pairs[k])
-            if wanted[k] and i not in partner and j not in partner:
-                partner[i], partner[j] = j, i
+    order = np.argsort(merges.cost)
+    _pair(partner, merges.pairs[order[merges.cost[order] < 1]])
+    _exchange(partner, price)
+    _pair(partner, merges.pairs[order[merges.touching[order]]])
     return partner
 
 
@@ -48,30 +70,84 @@ def follow(start: int, partner: dict[int, int]) -> list[int]:
     return entries
 
 
-def _merge_costs(
-    ridges: Ridges, ends: Ends, pairs: NDArray[np.int64], config: InitializationConfig
-) -> tuple[Float64, Bool]:
-    """What each joint costs, 1 being the most that is accepted, and whether the ends touch."""
-    i, j = pairs.T
-    positions, outward = ends.positions, ends.outward
-    across = positions[j] - positions[i]
-    distance = np.linalg.norm(across, axis=1)
-    direction = across / np.maximum(distance, 1e-9)[:, None]
-    turn = _angle(outward[i], -outward[j])
-    aside = np.maximum(_angle(outward[i], direction), _angle(-outward[j], direction))
-    # Where the ends are close the way across has no direction of its own.
-    sure = np.clip((distance - 1.5) / 4, 0, 1)
-    share = np.linspace(0, 1, 9)[None, :, None]
-    bridge = positions[i][:, None] + share * across[:, None]
-    seen = np.clip(ridges.sample(bridge.reshape(-1, 2)).reshape(-1, 9) / config.high, 0, 1)
-    missing = (1 - seen.mean(1)) * distance
-    limit = np.radians(config.merge_angle_deg) / (1 + missing / config.gap_px)
-    cost = (turn / limit) ** 2 + sure * (aside / limit) ** 2 + missing / config.gap_px
-    cost += 0.3 * distance / config.gap_px
-    cost += 0.5 * np.log(ends.strengths[i] / ends.strengths[j]) ** 2
-    touching = (distance < _TOUCHING_PX) & (seen.min(1) * config.high >= config.low)
-    return cost, touching
+def _pair(partner: dict[int, int], pairs: Int64) -> None:
+    for i, j in pairs.tolist():
+        if i not in partner and j not in partner:
+            partner[i], partner[j] = j, i
 
 
-def _angle(a: Float64, b: Float64) -> Float64:
-    return np.arccos(np.clip((a * b).sum(1), -1, 1))
+def _exchange(partner: dict[int, int], price: dict[tuple[int, int], float]) -> None:
+    """Swaps partners as long as that lowers the total."""
+
+    def cost(i: int | None, j: int | None) -> float:
+        if i is None or j is None:
+            return 0.0 if i is j else _FREE_END
+        return min(price.get((i, j), 2.0), 2 * _FREE_END + 1e-3)
+
+    improved = True
+    while improved:
+        improved = False
+        for i, j in list(price):
+            a, b = partner.get(i), partner.get(j)
+            if a == j or price[i, j] >= 1:
+                continue
+            if price[i, j] + cost(a, b) < cost(i, a) + cost(j, b) - 1e-9:
+                partner[i], partner[j] = j, i
+                for one, other in ((a, b), (b, a)):
+                    if one is None:
+                        continue
+                    if other is not None and price.get((one, other), 2.0) < 1:
+                        partner[one] = other
+                    else:
+                        partner.pop(one, None)
+                improved = True
+
+
+def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
+    """Prices every pair of ends within reach: whether one smooth curve runs through both segments,
+    over ridge, at one strength."""
+    arms = [a for s in ridges.segments for a in (_arm(s), _arm(s[::-1]))]
+    positions = np.array([a[0] for a in arms])
+    strengths = np.array([ridges.sample(a).mean() for a in arms])
+    pairs = cKDTree(positions).query_pairs(2 * config.gap_px, output_type="ndarray")
+    pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
+    cost, touching = np.empty(len(pairs)), np.zeros(len(pairs), bool)
+    for k, (i, j) in enumerate(pairs):
+        misfit, swing, bridge = _common_curve(arms[i], arms[j])
+        distance = float(np.linalg.norm(positions[j] - positions[i]))
+        seen, weakest = _evidence(ridges, bridge, config)
+        missing = (1 - seen) * distance / config.gap_px
+        ratio = float(np.log(strengths[i] / strengths[j]))
+        cost[k] = (
+            misfit + _SWING * swing**2 + missing + 0.1 * distance / config.gap_px + 0.25 * ratio**2
+        )
+        touching[k] = distance < _TOUCHING_PX and weakest >= config.low
+    return Merge(pairs, cost, touching)
+
+
+def _arm(segment: Float64) -> Float64:
+    return segment[min(_CLEAR, len(segment) // 4) : ARM]
+
+
+def _common_curve(one: Float64, other: Float64) -> tuple[float, float, Float64]:
+    """A cubic through both arms: its mean squared misfit, px^2, by how many radians per length its
+    curvature changes over it, and the cubic between the arms."""
+    distance = float(np.linalg.norm(other[0] - one[0]))
+    t = np.r_[-np.arange(len(one), dtype=float), distance + np.arange(len(other))]
+    scale = max(abs(t).max(), 1.0)
+    design = np.vander(t / scale, 4)
+    points = np.r_[one, other]
+    coefficients, *_ = np.linalg.lstsq(design, points, rcond=None)
+    misfit = float((((design @ coefficients - points) ** 2).sum(1)).mean())
+    swing = 6 * float(np.linalg.norm(coefficients[0])) / scale**3 * float(np.ptp(t)) ** 2
+    between = np.linspace(0, distance, _BRIDGE_SAMPLES) / scale
+    return misfit, swing, np.vander(between, 4) @ coefficients
+
+
+def _evidence(ridges: Ridges, bridge: Float64, config: InitializationConfig) -> tuple[float, float]:
+    """Share of the bridge that is on ridge of its direction, and the least ||V|| on it."""
+    tangents = np.gradient(bridge, axis=0)
+    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+    along = search.responses(ridges.field, bridge, tangents)
+    share = float(np.clip(along / config.high, 0, 1).mean())
+    return share, float(ridges.sample(bridge).min())

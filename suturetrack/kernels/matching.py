@@ -6,16 +6,26 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from suturetrack.kernels.search import response_at
 from suturetrack.types import Float32, Float64
 
 Int64 = NDArray[np.int64]
 
+UNSEEN = 0.5
+"""Cost of a place that lies outside the right image."""
+
 
 @numba.njit(cache=True, nogil=True)
 def matching_costs(
-    field: Float32, pixels: Float64, tangents: Float64, first: float, step: float, count: int
+    field: Float32,
+    pixels: Float64,
+    tangents: Float64,
+    first: float,
+    step: float,
+    count: int,
+    level: float,
 ) -> Float32:
-    """(k, count) 1 - ||V|| weighed by direction at the place in the right view of each disparity.
+    """(k, count) 1 where the right view shows no thread at a disparity, 0 where it surely does.
 
     Args:
         field: (H, W, 2) right view.
@@ -24,30 +34,19 @@ def matching_costs(
         first: the disparity u_left - u_right of state 0, px.
         step: px from state to state.
         count: number of states.
+        level: response of eq. (4) that a thread is known to give.
     """
-    height, width, _ = field.shape
-    costs = np.ones((len(pixels), count), np.float32)
+    costs = np.empty((len(pixels), count), np.float32)
     for k in range(len(pixels)):
-        row = int(np.floor(pixels[k, 1]))
-        if row < 0 or row >= height - 1:
-            continue
-        fv = pixels[k, 1] - row
+        u, v = pixels[k]
+        tu, tv = tangents[k]
         for state in range(count):
-            u = pixels[k, 0] - first - step * state
-            column = int(np.floor(u))
-            if column < 0 or column >= width - 1:
-                continue
-            fu = u - column
-            total = 0.0
-            for j in range(2):
-                for i in range(2):
-                    x, y = field[row + j, column + i, 0], field[row + j, column + i, 1]
-                    length = np.sqrt(x * x + y * y)
-                    if length > 0:
-                        along = tangents[k, 0] * x + tangents[k, 1] * y
-                        share = (fv if j else 1 - fv) * (fu if i else 1 - fu)
-                        total += share * 0.5 * (length + along * along / length)
-            costs[k, state] = max(1 - total, 0.0)
+            across = u - first - step * state
+            if 0 <= across <= field.shape[1] - 1:
+                response = response_at(field, across, v, tu, tv)
+                costs[k, state] = max(1 - response / level, 0.0)
+            else:
+                costs[k, state] = UNSEEN
     return costs
 
 
