@@ -20,9 +20,11 @@ from services.source import SourceConfig
 from services.sources import InputConfig
 from services.tracker import TrackerConfig
 from suturetrack import nurbs
+from suturetrack.initialization import initialize
 from suturetrack.metrics import curve_error
+from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
-from suturetrack.types import Seed, Status, ThreadState, Truth
+from suturetrack.types import RidgeField, Seed, Stamp, Status, StereoFrame, ThreadState, Truth
 
 FRAMES = 8
 STAGE = InputConfig("stage:figure8-107", frames=FRAMES)
@@ -150,6 +152,24 @@ def test_lock_step_gives_the_same_twice_to_the_bit(
     assert [bits(s) for s in again.states] == [bits(s) for s in outcome.states]
     times = [s.stamp.capture_ns for s in again.states]
     assert times == [round(i * 1e9 / 30) for i in range(FRAMES)]
+
+
+def test_the_first_curve_does_not_depend_on_where_the_field_lies_in_memory() -> None:
+    scene = open_scene("figure8-107")
+    frame = StereoFrame(Stamp(0, 0, 0), *scene.render(0))
+    field = Segmenter(scene.rig).step(frame)
+    curves = set()
+    for offset in (*range(0, 16, 3), 0):
+        memory = np.empty(field.left.size + 16, np.float32)
+        shifted = memory[offset : offset + field.left.size].reshape(field.left.shape)
+        shifted[:] = field.left
+        found = initialize(
+            RidgeField(field.stamp, shifted, field.right),
+            scene.rig,
+            Seed(pixel=scene.seed_pixel(0)),
+        )
+        curves.add(found.curve.control_points.tobytes())
+    assert len(curves) == 1
 
 
 def test_a_seed_on_no_thread_ends_the_tracker_with_the_reason() -> None:
