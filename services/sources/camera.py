@@ -37,7 +37,7 @@ class CameraFootage:
         images: list[Image] = []
         for name, capture, ok in zip(self._names, self._captures, grabbed, strict=True):
             decoded, image = capture.retrieve() if ok else (False, None)
-            if not decoded:
+            if not decoded or image is None:
                 raise InputError(f"camera {name}: no image after {index} frames; is it connected?")
             images.append(image)
         left, right = images if len(images) == 2 else halves(images[0], self._names[0])
