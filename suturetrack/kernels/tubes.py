@@ -77,7 +77,12 @@ def splat(strand: int, path: Float64, window: int, fragments: Fragments) -> None
         first_column = max(math.ceil(min(u0, path[i + 1, 0]) - reach), 0)
         last_column = min(math.floor(max(u0, path[i + 1, 0]) + reach), width - 1)
         for row in range(first_row, last_row + 1):
-            for column in range(first_column, last_column + 1):
+            left, right = first_column, last_column
+            if abs(dv) > 1e-3:
+                middle, half = u0 + (row - v0) * du / dv, reach / abs(dv)
+                left = max(left, math.ceil(middle - half))
+                right = min(right, math.floor(middle + half))
+            for column in range(left, right + 1):
                 along = (column - u0) * du + (row - v0) * dv
                 across = (row - v0) * du - (column - u0) * dv
                 place = along
@@ -108,6 +113,11 @@ def splat(strand: int, path: Float64, window: int, fragments: Fragments) -> None
                 value[entry, 1] = distance if across >= 0 else -distance
 
 
+@numba.njit(cache=True, fastmath=True, nogil=True, inline="always")
+def _between(table: Float64, row: int, column: int, share: float) -> float:
+    return table[row, column] + share * (table[row + 1, column] - table[row, column])
+
+
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def shade(
     first: int, path: Float64, light: Float64, colour: Float64, gloss: Float64, fragments: Fragments
@@ -128,11 +138,15 @@ def shade(
     for entry in range(first, used[0]):
         i, t = link[entry, 2], value[entry, 0]
         inside = min(max(t, 0.0), 1.0)
-        radius = path[i, 3] + inside * (path[i + 1, 3] - path[i, 3])
-        blur = path[i, 4] + inside * (path[i + 1, 4] - path[i, 4])
+        radius = _between(path, i, 3, inside)
+        blur = _between(path, i, 4, inside)
         offset = value[entry, 1]
         scale = 1.0 / (math.sqrt(2.0) * blur)
-        cover = 0.5 * (math.erf((offset + radius) * scale) - math.erf((offset - radius) * scale))
+        cover = 1.0
+        if abs(offset) > radius - 3.0 * blur:
+            cover = 0.5 * (
+                math.erf((offset + radius) * scale) - math.erf((offset - radius) * scale)
+            )
         length = math.hypot(path[i + 1, 0] - path[i, 0], path[i + 1, 1] - path[i, 1])
         if i == 0:
             cover *= 0.5 * math.erfc(-t * length * scale)
@@ -140,12 +154,15 @@ def shade(
             cover *= 0.5 * math.erfc((t - 1.0) * length * scale)
         x = min(max(offset / (radius + 0.7 * blur), -1.0), 1.0)
         front = math.sqrt(1.0 - x * x)
-        diffuse = max(x * light[i, 0] + front * light[i, 1], 0.0)
-        shine = max(x * light[i, 2] + front * light[i, 3], 0.0) ** gloss[2] * gloss[1] * 255.0
-        value[entry, 2] = path[i, 2] + inside * (path[i + 1, 2] - path[i, 2])
+        diffuse = x * _between(light, i, 0, inside) + front * _between(light, i, 1, inside)
+        shine = x * _between(light, i, 2, inside) + front * _between(light, i, 3, inside)
+        shine = 0.0 if gloss[1] == 0.0 else max(shine, 0.0) ** gloss[2] * gloss[1] * 255.0
+        value[entry, 2] = _between(path, i, 2, inside)
         value[entry, 3] = cover * gloss[3]
         for c in range(3):
-            value[entry, 4 + c] = colour[c] * (gloss[0] + (1.0 - gloss[0]) * diffuse) + shine
+            value[entry, 4 + c] = (
+                colour[c] * (gloss[0] + (1.0 - gloss[0]) * max(diffuse, 0.0)) + shine
+            )
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)

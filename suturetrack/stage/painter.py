@@ -40,12 +40,12 @@ def gripper_strands(gripper: Float64) -> list[Strand]:
     first, second, wrist = gripper
     back = wrist - (first + second) / 2
     back /= np.linalg.norm(back)
-    share = np.linspace(0, 1, 12)[:, None]
+    share = np.linspace(0, 1, 5)[:, None]
     jaws = [
-        Strand(tip + share * (wrist - tip), np.linspace(*_JAW_RADII, 12), STEEL, is_tool=True)
+        Strand(tip + share * (wrist - tip), np.linspace(*_JAW_RADII, 5), STEEL, is_tool=True)
         for tip in (first, second)
     ]
-    along = np.linspace(0, _SHAFT_LENGTH, 60)
+    along = np.r_[0.0, np.linspace(2.0, _SHAFT_LENGTH, 14)]
     radius = np.minimum(_JAW_RADII[1] + 0.6 * along, _SHAFT_RADIUS)
     shaft = Strand(wrist + along[:, None] * back, radius, STEEL, is_tool=True)
     return [*jaws, shaft]

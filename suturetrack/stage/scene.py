@@ -181,12 +181,12 @@ class Scene:
         return appearance.compressed(picture, self._look.jpeg)
 
     def _moments(self, time: float) -> Float64:
-        """Times spread over the exposure around `time`, one for each pixel that something moves."""
+        """Times spread over the exposure around `time`, one for every 2 px that something moves."""
         open_for = self._shutter / self.fps
         marks = [_marks(self._strands(time + way * open_for / 2)) for way in (-1, 1)]
         pixels = [self._real_rig.project_raw(self._view.to_camera(m))[0] for m in marks]
         moved = float(np.linalg.norm(pixels[1] - pixels[0], axis=1).max())
-        count = int(np.clip(np.ceil(moved / 1.5), 1, _MOST_EXPOSURES))
+        count = int(np.clip(np.ceil(moved / 2), 1, _MOST_EXPOSURES))
         return time + open_for * ((np.arange(count) + 0.5) / count - 0.5)
 
     def _strands(self, time: float) -> list[Strand]:

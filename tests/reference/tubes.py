@@ -42,7 +42,9 @@ def strand(
     cover *= np.where(last, 0.5 * (1 - erf((t - 1) * length[-1] * scale)), 1)
     x = np.clip(side / (radius + 0.7 * blur), -1, 1)
     front = np.sqrt(1 - x**2)
-    l0, l1, l2, l3 = (take(light[:-1, k]) for k in range(4))
+    l0, l1, l2, l3 = (
+        take(light[:-1, k]) + inside * take(light[1:, k] - light[:-1, k]) for k in range(4)
+    )
     diffuse = np.maximum(x * l0 + front * l1, 0)
     shine = 255 * gloss[1] * np.maximum(x * l2 + front * l3, 0) ** gloss[2]
     shown = colour * (gloss[0] + (1 - gloss[0]) * diffuse)[..., None] + shine[..., None]
