@@ -244,7 +244,7 @@ class _View:
         if image.ndim == 2:
             np.multiply(image, look.weights.sum(), out=self.plane)
         else:
-            cv2.split(image, self._channels)
+            cv2.split(np.ascontiguousarray(image), self._channels)
             ridge.mix_channels(*self._channels, look.weights, self.plane)
 
     def filter(self, plane: Float32, look: _Look, slot: int) -> Float32:

@@ -207,7 +207,7 @@ def _ridge_row(
         length = _decay(ratio * ratio * ratio_scale) * (_one - _decay(s2 * strength_scale))
         # v_1 is half the angle whose cosine and sine these are, taken in [0, pi).
         scale = -sign / (root + _tiny)
-        cosine, sine = difference * scale, twist * scale
+        cosine, sine = difference * scale if root > _zero else _one, twist * scale
         major = np.sqrt(_half + _half * abs(cosine))
         minor = _half * abs(sine) / major
         u = length * (major if cosine >= _zero else minor)

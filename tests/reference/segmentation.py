@@ -1,4 +1,4 @@
-"""Eq. (1) and Algorithm 1 to the letter, in float64 and pixel by pixel."""
+"""Eq. (1) and Algorithm 1 to the letter, in float64."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 
 
 def gaussian_derivatives(sigma):
-    """(3, 2r + 1) taps, for correlation, of the Gaussian and of its first two derivatives."""
+    """Taps, for correlation, of the Gaussian, sigma times its first and sigma^2 times its second
+    derivative, made exact for parabolas: each (2r + 1,)."""
     radius = math.ceil(3 * sigma)
     x = np.arange(-radius, radius + 1, dtype=float)
     g = np.exp(-(x**2) / (2 * sigma**2))
@@ -59,22 +60,24 @@ def strongest(fields):
 
 
 def blur_angles(v_r, kernel):
-    """Algorithm 1, the taps in raster order."""
+    """Algorithm 1, for all pixels at a time, the taps in raster order."""
     height, width, _ = v_r.shape
     radius = len(kernel) // 2
     padded = np.pad(v_r, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
-    v_o = np.empty_like(v_r)
-    for i in range(height):
-        for j in range(width):
-            v_t = kernel[radius, radius] * v_r[i, j]
-            for l in range(len(kernel)):  # noqa: E741
-                for s in range(len(kernel)):
-                    if l == s == radius:
-                        continue
-                    neighbour = padded[i + l, j + s]
-                    if v_t @ neighbour > 0:
-                        v_t = v_t + kernel[l, s] * neighbour
-                    else:
-                        v_t = v_t - kernel[l, s] * neighbour
-            v_o[i, j] = v_t
-    return v_o
+    v_t = kernel[radius, radius] * v_r
+    for row in range(len(kernel)):
+        for column in range(len(kernel)):
+            if row == column == radius:
+                continue
+            neighbour = padded[row : row + height, column : column + width]
+            d = np.sum(v_t * neighbour, axis=-1, keepdims=True)
+            weighted = kernel[row, column] * neighbour
+            v_t = np.where(d > 0, v_t + weighted, v_t - weighted)
+    return v_t
+
+
+def gaussian_kernel(sigma):
+    """G of Algorithm 1."""
+    offsets = np.arange(-2, 3, dtype=float)
+    kernel = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * sigma**2))
+    return kernel / kernel.sum()

@@ -1,0 +1,508 @@
+"""The ridge field: its twin, its invariances, and what the learned contrast is worth."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from suturetrack.camera import StereoRig
+from suturetrack.contrast import GRAY, SIGMAS, contrast_at
+from suturetrack.kernels import ridge
+from suturetrack.segmentation import (
+    SegmentationConfig,
+    Segmenter,
+    direction_image,
+    direction_key,
+    gaussian_kernel,
+)
+from suturetrack.stage import Scene, open_scene
+from suturetrack.stage.appearance import Picture
+from suturetrack.types import Float32, Float64, Image, InputError, Seed, Stamp, StereoFrame
+from tests.conftest import make_rig
+from tests.reference import segmentation as reference
+
+STAMP = Stamp(0, 0, 0)
+CHANNELS = {"gray": GRAY, "blue": (1, 0, 0), "green": (0, 1, 0), "red": (0, 0, 1)}
+
+
+def small_rig(width: int, height: int) -> StereoRig:
+    k, none = np.array([[500.0, 0, width / 2], [0, 500.0, height / 2], [0, 0, 1]]), np.zeros(5)
+    shift = np.array([-10.0, 0, 0])
+    return StereoRig.from_calibration((width, height), (k, none), (k, none), np.eye(3), shift, 1e-3)
+
+
+def segment(left: Image, config: SegmentationConfig, right: Image | None = None) -> Float32:
+    segmenter = Segmenter(small_rig(left.shape[1], left.shape[0]), config)
+    return segmenter.step(StereoFrame(STAMP, left, left if right is None else right)).left
+
+
+def literal(image: Image, config: SegmentationConfig) -> Float64:
+    plane = image if image.ndim == 2 else image @ np.asarray(CHANNELS[config.channel], float)
+    polarity = {"auto": "dark"}.get(config.polarity, config.polarity)
+    scales = [
+        reference.ridge_vectors(plane, sigma, config.beta, config.c, polarity)
+        for sigma in config.sigmas or SIGMAS[:1]
+    ]
+    return reference.blur_angles(
+        reference.strongest(scales), reference.gaussian_kernel(config.blur)
+    )
+
+
+def assert_equal_fields(field: Float32, twin: Float64) -> None:
+    """Vectors are directions: equal up to their sign."""
+    error = np.minimum(np.abs(field - twin).max(-1), np.abs(field + twin).max(-1))
+    assert np.mean(error > 1e-4) <= 1e-4
+    assert error.max() < 5e-3
+
+
+def line_image(angle: float, width: float = 2.0, dark: bool = True, size: int = 81) -> Image:
+    """A soft straight thread through the middle of a gray image."""
+    v, u = np.mgrid[:size, :size] - (size - 1) / 2
+    distance = np.abs(np.cos(angle) * v - np.sin(angle) * u)
+    share = 1 / (1 + np.exp(4 * (distance - width / 2)))
+    return np.rint(150 + (-90 if dark else 90) * share).astype(np.uint8)
+
+
+# --- equal to the literal equations ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("polarity", ["dark", "bright", "both"])
+@pytest.mark.parametrize("sigmas", [(1.2,), (2.4,), (1.0, 2.0)])
+def test_noise_gives_the_literal_field(polarity: str, sigmas: tuple[float, ...]) -> None:
+    config = SegmentationConfig(sigmas=sigmas, c=60.0, channel="green", polarity=polarity)
+    image = np.random.default_rng(3).integers(0, 256, (480, 640, 3), np.uint8)
+    assert_equal_fields(segment(image, config), literal(image, config))
+
+
+@pytest.mark.parametrize("channel", ["gray", "red"])
+@pytest.mark.parametrize("scene", ["figure8-175", "crossings"])
+def test_a_scene_gives_the_literal_field(scene: str, channel: str) -> None:
+    config = SegmentationConfig(c=6.0, channel=channel, polarity="both")
+    image = open_scene(scene, 11).render(0)[0]
+    field = segment(image, config)
+    assert np.linalg.norm(field, axis=-1).max() > 0.3
+    assert_equal_fields(field, literal(image, config))
+
+
+@given(
+    height=st.integers(1, 40),
+    width=st.integers(1, 60),
+    seed=st.integers(0, 2**32 - 1),
+    sigma=st.floats(0.6, 3.5),
+    beta=st.floats(0.1, 1.0),
+    polarity=st.sampled_from(["dark", "bright", "both"]),
+    layout=st.sampled_from(["C", "F", "mirrored", "window"]),
+    channel=st.sampled_from(["gray", "blue", "green", "red", None]),
+)
+def test_any_size_and_layout_gives_the_literal_field(
+    height, width, seed, sigma, beta, polarity, layout, channel
+) -> None:
+    rng = np.random.default_rng(seed)
+    shape = (height, width) if channel is None else (height, width, 3)
+    image = rng.integers(0, 256, shape, np.uint8)
+    image = np.round(cv2.GaussianBlur(image, (0, 0), 0.8)).astype(np.uint8).reshape(shape)
+    config = SegmentationConfig((sigma,), beta, 20.0, 1.0, channel or "gray", polarity)
+    given_image = {
+        "C": image,
+        "F": np.asfortranarray(image),
+        "mirrored": np.ascontiguousarray(image[:, ::-1])[:, ::-1],
+        "window": np.pad(image, [(3, 5), (2, 1)] + [(0, 0)] * (image.ndim - 2))[3:-5, 2:-1],
+    }[layout]
+    field, twin = segment(given_image, config), literal(image, config)
+    error = np.minimum(np.abs(field - twin).max(-1), np.abs(field + twin).max(-1))
+    # A sign decided by rounding changes single pixels; nothing else may differ.
+    assert np.count_nonzero(error > 1e-4) <= 1
+    assert np.linalg.norm(field, axis=-1).max() <= 1 + 1e-6
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.5, 0.999))
+def test_the_quantile_is_numpys(seed: int, share: float) -> None:
+    values = np.random.default_rng(seed).gamma(0.5, 30, (40, 64)).astype(np.float32)
+    lowest, highest = np.quantile(values[:, ::2], [share - 2e-3, min(share + 2e-3, 1)])
+    assert lowest * 0.99 <= ridge.quantile(values, share) <= highest * 1.01
+
+
+def test_the_quantile_of_nothing_is_nothing() -> None:
+    assert ridge.quantile(np.zeros((4, 6), np.float32), 0.998) == 0
+
+
+# --- what the field means -------------------------------------------------------------------------
+
+
+@given(st.floats(0, np.pi), st.floats(1.5, 4.0))
+def test_vectors_point_along_the_thread(angle: float, width: float) -> None:
+    field = segment(line_image(angle, width), SegmentationConfig())
+    middle = field[38:43, 38:43].reshape(-1, 2)
+    strongest = middle[np.argmax(np.linalg.norm(middle, axis=1))]
+    assert np.linalg.norm(strongest) > 0.3
+    along = np.array([np.cos(angle), np.sin(angle)])
+    assert abs(strongest @ along) > np.cos(np.radians(1.5)) * np.linalg.norm(strongest)
+
+
+@pytest.mark.parametrize(
+    ("polarity", "dark", "seen"),
+    [
+        ("dark", True, True),
+        ("dark", False, False),
+        ("bright", True, False),
+        ("bright", False, True),
+        ("both", True, True),
+        ("both", False, True),
+        ("auto", True, True),
+    ],
+)
+def test_polarity_decides_which_threads_are_seen(polarity: str, dark: bool, seen: bool) -> None:
+    field = segment(line_image(0.4, dark=dark), SegmentationConfig(c=10.0, polarity=polarity))
+    assert (np.linalg.norm(field[40, 40]) > 0.3) == seen
+
+
+def test_several_scales_see_thin_and_wide_threads() -> None:
+    image = np.minimum(
+        np.roll(line_image(0.0, 1.5, size=121), -40, 0),
+        np.roll(line_image(0.0, 12.0, size=121), 20, 0),
+    )
+    rows = np.array([20, 80])
+    strength = {
+        sigmas: np.linalg.norm(segment(image, SegmentationConfig(sigmas, c=10.0)), axis=-1)[
+            rows, 60
+        ]
+        for sigmas in [(1.0,), (5.0,), (1.0, 5.0)]
+    }
+    assert strength[(1.0,)][1] < 0.1 < 0.4 < strength[(1.0,)][0]
+    assert strength[(5.0,)][1] > 0.4
+    assert (strength[(1.0, 5.0)] > 0.4).all()
+
+
+def test_a_rig_that_is_not_rectified_gives_rectified_pixels(distorted_rig: StereoRig) -> None:
+    points = np.c_[np.linspace(-30, 30, 400), np.linspace(-25, 20, 400), np.full(400, 200.0)]
+    images = []
+    for pixels in distorted_rig.project_raw(points):
+        image = np.full((480, 640), 170, np.uint8)
+        at = np.rint(pixels * 16).astype(np.int32)
+        cv2.polylines(image, [at], False, 60, 3, cv2.LINE_AA, 4)
+        images.append(image)
+    field = Segmenter(distorted_rig).step(StereoFrame(STAMP, *images))
+    for view, pixels in zip((field.left, field.right), distorted_rig.project(points), strict=True):
+        strength = np.linalg.norm(view, axis=-1)
+        inner = pixels[20:-20]
+        normal = np.array([-1, 1]) * np.gradient(inner, axis=0)[:, ::-1]
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        offsets = np.arange(-3, 3.1, 0.5)
+        around = (inner[:, None] + offsets[:, None] * normal[:, None]).astype(np.float32)
+        profile = cv2.remap(strength, around, None, cv2.INTER_LINEAR)
+        assert np.abs(np.median(offsets[profile.argmax(1)])) <= 0.5
+        assert np.median(profile.max(1)) > 0.3
+
+
+def test_the_kernel_of_algorithm_1_is_a_gaussian() -> None:
+    np.testing.assert_allclose(gaussian_kernel(1.3), reference.gaussian_kernel(1.3), atol=1e-7)
+
+
+# --- time and memory ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rectified", [True, False])
+def test_no_image_is_allocated_once_warm(rectified: bool, distorted_rig: StereoRig) -> None:
+    scene = open_scene("figure8-107", 5)
+    segmenter = Segmenter(scene.rig if rectified else distorted_rig)
+    frame = StereoFrame(STAMP, *scene.render(0))
+    segmenter.warm_up()
+    segmenter.learn(frame, Seed(pixel=scene.seed_pixel()))
+    for _ in range(3):
+        segmenter.step(frame)
+    tracemalloc.start()
+    segmenter.step(frame)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 640 * 480 / 4
+
+
+def test_a_field_lives_for_three_more_steps() -> None:
+    frames = [
+        StereoFrame(Stamp(i, 0, 0), image, image)
+        for i, image in enumerate(line_image(0.3 * i) for i in range(4))
+    ]
+    segmenter = Segmenter(small_rig(81, 81))
+    fields = [segmenter.step(frame) for frame in frames]
+    again = [Segmenter(small_rig(81, 81), SegmentationConfig(c=9.0)).step(f) for f in frames]
+    for field, alone in zip(fields, again, strict=True):
+        assert abs(direction(field.left[40, 40]) - direction(alone.left[40, 40])) < 0.02
+    assert len({round(direction(field.left[40, 40]), 1) for field in fields}) == 4
+
+
+def direction(vector: Float32) -> float:
+    return float(np.arctan2(vector[1], vector[0]) % np.pi)
+
+
+# --- automatic c ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A violet thread on red and orange marbled paper."""
+    return open_scene("figure8-175", 21, picture=Picture("violet", "marbled"))
+
+
+def thread_pixels(scene: Scene, frame: int = 0) -> Float64:
+    truth = scene.truth(frame)[0]
+    return scene.rig.project(truth.points)[0][truth.visible]
+
+
+def on_thread(field: Float32, pixels: Float64) -> Float64:
+    strength = cv2.dilate(np.linalg.norm(field, axis=-1), np.ones((3, 3)))
+    u, v = np.rint(pixels).astype(int).T
+    return strength[v, u]
+
+
+@pytest.mark.parametrize("learned", [True, False])
+@pytest.mark.parametrize("gain", [0.5, 1.3])
+def test_a_step_of_the_exposure_does_not_flicker(scene: Scene, learned: bool, gain: float) -> None:
+    segmenter = Segmenter(scene.rig, SegmentationConfig(channel="learned" if learned else "red"))
+    pixels, strengths = thread_pixels(scene), []
+    left, right = scene.render(0)
+    if learned:
+        segmenter.learn(StereoFrame(STAMP, left, right), Seed(pixel=scene.seed_pixel()))
+    for i in range(16):
+        exposure = 0.75 * (gain if i >= 8 else 1.0)
+        images = [np.rint(image * exposure).astype(np.uint8) for image in (left, right)]
+        field = segmenter.step(StereoFrame(Stamp(i, 0, 0), *images))
+        strengths.append(np.median(on_thread(field.left, pixels)))
+    assert min(strengths) > 0.3
+    assert np.ptp(strengths[7:10]) < 0.03
+    assert np.ptp(strengths[4:]) < 0.05
+
+
+def test_noise_does_not_make_the_field_flicker(scene: Scene) -> None:
+    segmenter = Segmenter(scene.rig, SegmentationConfig(channel="red"))
+    pixels = thread_pixels(scene)
+    images = scene.render(0)
+    rng, strengths = np.random.default_rng(0), []
+    for i in range(12):
+        noisy = [
+            np.clip(np.rint(image + rng.normal(0, 2, image.shape)), 0, 255).astype(np.uint8)
+            for image in images
+        ]
+        field = segmenter.step(StereoFrame(Stamp(i, 0, 0), *noisy))
+        strengths.append(np.median(on_thread(field.left, pixels)))
+    assert np.std(strengths) < 0.01
+
+
+# --- learned contrast -----------------------------------------------------------------------------
+
+
+def centre_errors(field: Float32, pixels: Float64) -> Float64:
+    """How far beside the thread's middle the strongest response lies, px, within 4 px."""
+    tangent = np.gradient(pixels, axis=0)
+    normal = np.array([-1, 1]) * tangent[:, ::-1] / np.linalg.norm(tangent, axis=1, keepdims=True)
+    offsets = np.arange(-4, 4.1, 0.25)
+    around = pixels[:, None] + offsets[:, None] * normal[:, None]
+    strength = np.linalg.norm(field, axis=-1)
+    profile = cv2.remap(strength, around.astype(np.float32), None, cv2.INTER_LINEAR)
+    return np.abs(offsets[profile.argmax(1)])
+
+
+def learned_field(scene: Scene, seed: Seed, config: SegmentationConfig) -> Float32:
+    segmenter = Segmenter(scene.rig, config)
+    frame = StereoFrame(STAMP, *scene.render(0))
+    segmenter.learn(frame, seed)
+    return segmenter.step(frame).left
+
+
+@pytest.mark.parametrize("rig", ["bench", "endoscope"])
+@pytest.mark.parametrize("background", ["marbled", "plain"])
+@pytest.mark.parametrize("thread", ["violet", "black", "blue", "undyed"])
+def test_the_learned_mix_finds_the_middle_of_any_thread(
+    thread: str, background: str, rig: str
+) -> None:
+    scene = open_scene("figure8-107", 31, rig, picture=Picture(thread, background))
+    pixels = thread_pixels(scene)[5:-5]
+    seed = Seed(pixel=scene.seed_pixel())
+    learned = centre_errors(learned_field(scene, seed, SegmentationConfig()), pixels)
+    gray = centre_errors(learned_field(scene, seed, SegmentationConfig(channel="gray")), pixels)
+    assert np.mean(learned > 1) < 0.02
+    assert np.mean(learned) < 0.35
+    assert np.mean(learned) <= np.mean(gray)
+
+
+def test_a_violet_thread_stands_out_from_red_only_in_the_learned_mix(scene: Scene) -> None:
+    seed, pixels = Seed(pixel=scene.seed_pixel()), thread_pixels(scene)[5:-5]
+    astray = {
+        channel: np.mean(
+            centre_errors(learned_field(scene, seed, SegmentationConfig(channel=channel)), pixels)
+            > 1
+        )
+        for channel in ("learned", "red", "gray")
+    }
+    assert astray["learned"] < 0.01 < astray["red"] < astray["gray"]
+    assert astray["gray"] > 0.1
+
+
+@given(st.integers(0, 10**6), st.floats(0, 6.0), st.floats(0, 2 * np.pi))
+@settings(max_examples=15)
+def test_any_seed_near_the_thread_teaches(
+    scene: Scene, place: int, distance: float, way: float
+) -> None:
+    pixels = thread_pixels(scene)
+    u, v = pixels[20 + place % (len(pixels) - 40)] + distance * np.array([np.cos(way), np.sin(way)])
+    field = learned_field(scene, Seed(pixel=(u, v)), SegmentationConfig())
+    assert np.mean(centre_errors(field, pixels[5:-5]) > 1) < 0.02
+
+
+def test_a_point_teaches_as_its_pixel_does(scene: Scene) -> None:
+    points = scene.truth(0)[0].points
+    point = points[len(points) // 2]
+    u, v = scene.rig.project_raw(point)[0]
+    np.testing.assert_array_equal(
+        learned_field(scene, Seed(point=tuple(point)), SegmentationConfig()),
+        learned_field(scene, Seed(pixel=(u, v)), SegmentationConfig()),
+    )
+
+
+def test_a_seed_on_nothing_teaches_nothing(scene: Scene) -> None:
+    far = np.array([[u, v] for u in range(40, 600, 40) for v in range(40, 440, 40)], float)
+    distance = np.linalg.norm(far[:, None] - thread_pixels(scene), axis=2).min(1)
+    image = scene.render(0)[0]
+    nothing = [tuple(pixel) for pixel in far[distance > 40]]
+    assert len(nothing) > 20
+    assert sum(contrast_at(image, pixel) is not None for pixel in nothing) <= len(nothing) // 20
+
+
+def test_a_wide_thread_gets_a_wide_filter() -> None:
+    for width, lowest, highest in ((1.5, 1.2, 1.2), (10.0, 2.0, 4.0)):
+        contrast = contrast_at(line_image(0.3, width, size=161), (80.0, 80.0))
+        assert contrast is not None
+        assert lowest <= contrast.sigma <= highest
+
+
+@pytest.mark.parametrize("channel", ["learned", "gray", "red"])
+@pytest.mark.parametrize("coloured", [True, False])
+def test_a_bright_thread_is_seen_after_the_seed(channel: str, coloured: bool) -> None:
+    image = line_image(0.4, dark=False, size=161)
+    if coloured:
+        image = np.dstack([image, image, image])
+    rig, seed = small_rig(161, 161), Seed(pixel=(80.0, 80.0))
+    frame = StereoFrame(STAMP, image, image)
+    segmenter = Segmenter(rig, SegmentationConfig(channel=channel))
+    before = np.linalg.norm(segmenter.step(frame).left[80, 80])
+    segmenter.learn(frame, seed)
+    assert before < 0.15
+    assert np.linalg.norm(segmenter.step(frame).left[80, 80]) > 0.4
+
+
+def test_threads_of_different_colours_are_seen_together() -> None:
+    image = np.full((161, 161, 3), (60, 60, 190), np.uint8)
+    for row, colour in ((50, (150, 40, 70)), (110, (40, 40, 40))):
+        cv2.line(image, (0, row), (160, row), colour, 2, cv2.LINE_AA)
+    image = np.clip(image + np.random.default_rng(0).normal(0, 2, image.shape), 0, 255)
+    frame = StereoFrame(STAMP, *[image.astype(np.uint8)] * 2)
+    segmenter = Segmenter(small_rig(161, 161))
+    segmenter.learn(frame, Seed("a", pixel=(80.0, 50.0)))
+    segmenter.learn(frame, Seed("b", pixel=(80.0, 110.0)))
+    strength = np.linalg.norm(segmenter.step(frame).left, axis=-1)
+    assert (strength[[50, 110], 20:140].mean(1) > 0.4).all()
+    assert strength[75:90, 20:140].mean() < 0.05
+
+
+def test_the_contrast_follows_the_light(scene: Scene) -> None:
+    """The lamp turns from white to blue; who adapts keeps seeing the thread as well as at first."""
+    left, right = scene.render(0)
+    pixels = thread_pixels(scene)
+    following, staying = Segmenter(scene.rig), Segmenter(scene.rig)
+    first = StereoFrame(STAMP, left, right)
+    for segmenter in (following, staying):
+        segmenter.learn(first, Seed(pixel=scene.seed_pixel()))
+    fresh = np.median(on_thread(following.step(first).left, pixels))
+    for i in range(1, 25):
+        light = 1 + min(i, 16) / 16 * (np.array([1.9, 1.0, 0.45]) - 1)
+        images = [np.clip(np.rint(x * light), 0, 255).astype(np.uint8) for x in (left, right)]
+        frame = StereoFrame(Stamp(i, 0, 0), *images)
+        following.adapt(frame, pixels[10:-10:5])
+        kept, lost = (
+            np.median(on_thread(s.step(frame).left, pixels)) for s in (following, staying)
+        )
+    assert abs(kept - fresh) < 0.05
+    assert abs(lost - fresh) > 2 * abs(kept - fresh)
+
+
+def test_only_learned_threads_adapt(scene: Scene) -> None:
+    frame = StereoFrame(STAMP, *scene.render(0))
+    touched, untouched = Segmenter(scene.rig), Segmenter(scene.rig)
+    touched.adapt(frame, thread_pixels(scene)[::5])
+    np.testing.assert_array_equal(touched.step(frame).left, untouched.step(frame).left)
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "words"),
+    [
+        (np.zeros((480, 640), np.uint16), None, "8-bit"),
+        (np.zeros((480, 640, 3), np.float32), None, "8-bit"),
+        (np.zeros((0, 0, 3), np.uint8), None, "fits the calibration"),
+        (np.zeros((240, 320, 3), np.uint8), None, "fits the calibration"),
+        (np.zeros((480, 640, 4), np.uint8), None, "fits the calibration"),
+        (np.zeros((480, 640), np.uint8), np.zeros((480, 640, 3), np.uint8), "alike"),
+        (np.zeros((480, 640), np.uint8), np.zeros((480, 320), np.uint8), "right image"),
+    ],
+)
+def test_images_that_do_not_fit_are_refused(left, right, words: str) -> None:
+    segmenter = Segmenter(make_rig())
+    frame = StereoFrame(STAMP, left, left if right is None else right)
+    for act in (segmenter.step, lambda f: segmenter.learn(f, Seed(pixel=(3.0, 3.0)))):
+        with pytest.raises(InputError, match=words):
+            act(frame)
+
+
+@pytest.mark.parametrize("seed", [Seed(pixel=(700.0, 5.0)), Seed(point=(0.0, 900.0, 200.0))])
+def test_a_seed_outside_the_image_is_refused(seed: Seed) -> None:
+    blank = np.zeros((480, 640, 3), np.uint8)
+    with pytest.raises(InputError, match="outside the left image of 640x480"):
+        Segmenter(make_rig()).learn(StereoFrame(STAMP, blank, blank), seed)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"sigmas": ()}, {"sigmas": (0.0,)}, {"beta": -1.0}, {"c": 0.0}, {"blur": 0.0}]
+)
+def test_impossible_settings_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError):
+        SegmentationConfig(**wrong)
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_an_image_without_contrast_has_no_ridges(value: int) -> None:
+    blank = np.full((480, 640, 3), value, np.uint8)
+    segmenter, frame = Segmenter(make_rig()), StereoFrame(STAMP, blank, blank)
+    segmenter.learn(frame, Seed(pixel=(300.0, 200.0)))
+    assert not segmenter.step(frame).left.any()
+
+
+# --- false colour ---------------------------------------------------------------------------------
+
+
+def test_hue_is_direction_and_brightness_is_length() -> None:
+    angles = np.linspace(0, np.pi, 12, endpoint=False)
+    vectors = np.stack([np.cos(angles), np.sin(angles)], -1)[None].astype(np.float32)
+    colours = direction_image(vectors)[0]
+    np.testing.assert_array_equal(direction_image(-vectors)[0], colours)
+    assert len(np.unique(colours, axis=0)) == 12
+    assert (colours.max(1) == 255).all()
+    np.testing.assert_allclose(direction_image(vectors / 2)[0].max(1), 128, atol=1)
+    assert not direction_image(np.zeros((2, 2, 2), np.float32)).any()
+
+
+def test_the_key_shows_every_direction_in_its_colour() -> None:
+    key = direction_key(65)
+    assert key.shape == (65, 65, 3)
+    assert not key[0, 0].any()
+    assert not key[32, 32].any()
+    for angle in np.linspace(0, 2 * np.pi, 16, endpoint=False):
+        u, v = np.rint(32 + 22 * np.array([np.cos(angle), np.sin(angle)])).astype(int)
+        at = np.array([u - 32, v - 32], np.float32) / np.hypot(u - 32, v - 32)
+        expected = direction_image(at[None, None])[0, 0].astype(int)
+        np.testing.assert_allclose(key[v, u], expected, atol=12)
