@@ -67,7 +67,7 @@ def table_one(length: float, seed: int) -> Result:
     """One end fixed, the other on the stage that runs along a figure 8 at 11 mm/s."""
     shape = meander(np.random.default_rng(seed), length, 2.5, (60, 44), 7.0)
     held = {0: fixed(shape[0]), len(shape) - 1: figure8(shape[-1], (9, 4), 10.8)}
-    return Result(simulate([Thread(shape, held)], seconds=24))
+    return Result(simulate([Thread(shape, held)], seconds=24, step=1e-3))
 
 
 def crossings(seed: int) -> Result:
@@ -210,7 +210,7 @@ def two_threads() -> Result:
         {0: fixed(lower[0] * [1, 1, 0.2]), len(lower) - 1: figure8(lower[-1], (8, 4), 9.0)},
         {0: fixed(upper[0]), len(upper) - 1: figure8(upper[-1], (-6, 4), 10.5)},
     ]
-    return Result(simulate([Thread(lower, held[0]), Thread(upper, held[1])], seconds=22))
+    return Result(simulate([Thread(lower, held[0]), Thread(upper, held[1])], seconds=22, step=1e-3))
 
 
 def knot() -> Result:

@@ -185,8 +185,9 @@ class Scene:
         open_for = self._shutter / self.fps
         marks = [_marks(self._strands(time + way * open_for / 2)) for way in (-1, 1)]
         pixels = [self._real_rig.project_raw(self._view.to_camera(m))[0] for m in marks]
-        moved = float(np.linalg.norm(pixels[1] - pixels[0], axis=1).max())
-        count = int(np.clip(np.ceil(moved / 2), 1, _MOST_EXPOSURES))
+        shown = np.all((pixels[0] >= 0) & (pixels[0] < self.rig.image_size), axis=1)
+        moved = np.linalg.norm(pixels[1] - pixels[0], axis=1) * shown
+        count = int(np.clip(np.ceil(moved.max() / 2), 1, _MOST_EXPOSURES))
         return time + open_for * ((np.arange(count) + 0.5) / count - 0.5)
 
     def _strands(self, time: float) -> list[Strand]:
