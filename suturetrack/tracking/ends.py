@@ -123,7 +123,7 @@ class EndWatch:
         self._found_ns = now_ns
         self._last_ns = now_ns
         self._seen_ns = [now_ns, now_ns]
-        self._length = self._longest = length
+        self.length = self._longest = length
         self.seen = (True, True)
 
     def moves(
@@ -135,7 +135,7 @@ class EndWatch:
         doubted = self._doubted(steps, offsets, length, now_ns)
         seen = [end not in doubted for end in (0, 1)]
         for end in doubted:
-            lacking = self._length / length - 1.0 - offsets[1 - end]
+            lacking = self.length / length - 1.0 - offsets[1 - end]
             step = steps[end]
             if step is None or len(doubted) == 2:
                 offsets[end] = 0.0
@@ -167,9 +167,9 @@ class EndWatch:
             return []
         slack = _DRAWN_PX * max(step.pixel for step in shown) * length
         total = length * (1.0 + sum(offsets))
-        if total > max(self._length, self._longest) + slack:
+        if total > max(self.length, self._longest) + slack:
             return [int(np.argmax(offsets))]
-        if total < self._length - slack:
+        if total < self.length - slack:
             hidden = [end for end in (0, 1) if offsets[end] <= min(offsets) / 2]
             return [end for end in hidden if (now_ns - self._seen_ns[end]) * _NS < _HELD_S]
         return []
@@ -177,7 +177,7 @@ class EndWatch:
     def _remember(
         self, length: float, steps: tuple[EndStep | None, EndStep | None], now_ns: int
     ) -> None:
-        self._length = length
+        self.length = length
         if not any(step and step.at_border for step in steps):
             fading = np.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)
             self._longest = max(length, length + (self._longest - length) * float(fading))

@@ -14,13 +14,11 @@ from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange, respace
 from suturetrack.tracking.ends import EndWatch, find_end
 from suturetrack.tracking.energies import energies
-from suturetrack.tracking.gauss_newton import Fit
 from suturetrack.tracking.motion import Motion
+from suturetrack.tracking.reliability import Evidence, judge
 from suturetrack.tracking.sampling import Samples, views
-from suturetrack.types import Bool, Nurbs, RidgeField, Status, ThreadState
+from suturetrack.types import Nurbs, RidgeField, Status, ThreadState
 
-RELIABILITY_SAMPLES = 64
-_LOST_AFTER_S = 0.2
 _NS = 1e-9
 # Searches, in units of the first: tried where less than the second is seen, taken if they show more.
 _REACHES = ((1.0, 1.0, 0.0), (2.5, 0.95, 0.02), (6.5, 0.6, 0.1))
@@ -40,15 +38,6 @@ class Model:
     ends: EndWatch
 
 
-@dataclass(frozen=True, eq=False)
-class _Outcome:
-    fit: Fit
-    seen: Bool
-    """(k,) at the fit's samples."""
-    share: float
-    """Share of the curve's length that is seen."""
-
-
 class Follower:
     """Holds one thread's model and moves it from field to field."""
 
@@ -61,6 +50,11 @@ class Follower:
             curve, Motion.none(), levels, now, now, EndWatch(nurbs.length(curve), now)
         )
 
+    @property
+    def known_length(self) -> float:
+        """Length of the thread when all of it was last seen, calibration's unit."""
+        return self.model.ends.length
+
     def step(self, field: RidgeField, thread: str) -> ThreadState:
         """The thread in the next field."""
         model = self.model
@@ -68,23 +62,26 @@ class Follower:
         before = model.curve
         model.capture_ns = field.stamp.capture_ns
         if self.config.method == "paper":
-            outcome, inserted, removed = self._follow_by_forces(field)
+            evidence, inserted, removed = self._follow_by_forces(field)
         else:
-            outcome, inserted, removed = self._follow_by_least_squares(field, seconds)
-        seen = self._at_even_places(outcome)
+            evidence, inserted, removed = self._follow_by_least_squares(field, seconds)
         if self.config.method != "paper":
             model.motion = model.motion.learn(
-                before, model.curve, seen, model.ends.seen, self.rig, seconds
+                before, model.curve, evidence.evenly()[1], model.ends.seen, self.rig, seconds
             )
-        if outcome.share >= 0.5:
+        if evidence.share >= 0.5:
             model.seen_ns = model.capture_ns
             self._learn_levels(field)
         events = []
         if inserted or removed:
             events.append(f"control points: {inserted} inserted, {removed} removed")
-        return self._state(field, thread, outcome, seen, events)
+        astray = evidence.astray(field, self.rig, model.levels)
+        status = judge(evidence, astray, (model.capture_ns - model.seen_ns) * _NS)
+        if status is Status.TRACKING:
+            self.last_good = model.curve
+        return self._state(field, thread, evidence, status, events)
 
-    def _follow_by_forces(self, field: RidgeField) -> tuple[_Outcome, int, int]:
+    def _follow_by_forces(self, field: RidgeField) -> tuple[Evidence, int, int]:
         model, config = self.model, self.config
         cutoffs = (
             paper.cutoff(field.left, model.levels[0]),
@@ -93,18 +90,18 @@ class Follower:
         curve = paper.fit(model.curve, field, self.rig, cutoffs, config.paper)
         fit = gauss_newton.observe(curve, field, self.rig, model.levels, config)
         model.curve, inserted, removed = respace(curve, self.rig, config.paper.spacing_px)
-        return _outcome(fit), inserted, removed
+        return Evidence.of(fit), inserted, removed
 
     def _follow_by_least_squares(
         self, field: RidgeField, seconds: float
-    ) -> tuple[_Outcome, int, int]:
+    ) -> tuple[Evidence, int, int]:
         model, config = self.model, self.config
         predicted = model.motion.predict(model.curve, seconds)
-        best: _Outcome | None = None
+        best: Evidence | None = None
         for reach, enough, gain in _REACHES:
             if best is not None and best.share >= enough:
                 break
-            tried = _outcome(
+            tried = Evidence.of(
                 gauss_newton.fit(
                     predicted, field, self.rig, model.levels, reach * config.search_px, config
                 )
@@ -132,28 +129,11 @@ class Follower:
         old = self.model.levels
         self.model.levels = (0.8 * old[0] + 0.2 * now[0], 0.8 * old[1] + 0.2 * now[1])
 
-    def _at_even_places(self, outcome: _Outcome) -> Bool:
-        at = np.linspace(0, 1, RELIABILITY_SAMPLES)
-        s = outcome.fit.samples.s
-        return outcome.seen[np.clip(np.searchsorted(s, at), 0, len(s) - 1)]
-
     def _state(
-        self,
-        field: RidgeField,
-        thread: str,
-        outcome: _Outcome,
-        seen: Bool,
-        events: list[str],
+        self, field: RidgeField, thread: str, evidence: Evidence, status: Status, events: list[str]
     ) -> ThreadState:
-        model, fit = self.model, outcome.fit
-        unseen_s = (model.capture_ns - model.seen_ns) * _NS
-        if outcome.share >= 0.5:
-            status = Status.TRACKING
-        elif unseen_s < _LOST_AFTER_S or outcome.share > 0.2:
-            status = Status.OCCLUDED
-        else:
-            status = Status.LOST
-        sigma = np.sqrt(np.trace(fit.covariance, axis1=1, axis2=2))
+        model = self.model
+        sigma, seen = evidence.evenly()
         cutoffs = model.levels[0] / 2, model.levels[1] / 2
         return ThreadState(
             stamp=field.stamp,
@@ -162,18 +142,10 @@ class Follower:
             curve=model.curve,
             length=nurbs.length(model.curve),
             energies=energies(model.curve, field, self.rig, cutoffs),
-            sigma=np.interp(np.linspace(0, 1, RELIABILITY_SAMPLES), fit.samples.s, sigma),
+            sigma=sigma,
             seen=seen,
             events=tuple(events),
         )
-
-
-def _outcome(fit: Fit) -> _Outcome:
-    left, right = fit.offsets
-    with np.errstate(invalid="ignore"):
-        near = np.all(np.abs(fit.residual) < 1.5, axis=1)
-    seen = left.found & right.found & near
-    return _Outcome(fit, seen, float(np.sum(fit.samples.share * seen)))
 
 
 def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[float, float]:

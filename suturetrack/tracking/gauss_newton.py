@@ -7,6 +7,7 @@ count by the length of image curve that they stand for, so sampling and knots ma
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,11 +25,11 @@ _STEP_PX = 0.5
 _CORRELATION_PX = 4.0
 _PEAK_HALF_PX = 1.5
 _ROUGHNESS = 0.2
-_LEAST_RESPONSE = 0.25
+_LEAST_RESPONSE = 0.2
 _REFINED_PX = 3.0
 # A shorter run of samples that look like thread is chance.
 _SHORTEST_RUN_PX = 10.0
-_OUTLIER_PX = 0.5
+_OUTLIER_PX = 1.0
 _EVEN = 150.0
 
 
@@ -97,11 +98,14 @@ def fit(
     samples = Samples.of(predicted.knots, config.samples_per_span)
     reference = _Reference.of(samples, predicted)
     control_points = predicted.control_points
-    for iteration in range(config.iterations):
-        reach = reach_px if iteration == 0 else min(reach_px, _REFINED_PX)
+    reach, outlier = reach_px, math.inf
+    rounds = config.iterations + round(math.log2(max(reach_px / config.search_px, 1.0)))
+    for _ in range(rounds):
         linear = _Linearized(samples, control_points, field, rig, levels, reach)
-        equations = linear.equations(reference, levels, config, robust=iteration > 0)
+        equations = linear.equations(reference, levels, config, outlier)
         control_points = control_points + equations.solve()
+        outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
+        reach = max(reach / 2, _REFINED_PX)
     curve = curve_from(spline.DEGREE, predicted.knots, control_points)
     residual = _residual(rig.project(samples.values(control_points)), linear)
     return Fit(curve, samples, linear.offsets, residual, equations.covariance(samples))
@@ -117,7 +121,7 @@ def observe(
     """What the field says about a curve that something else has fitted."""
     samples = Samples.of(curve.knots, config.samples_per_span)
     linear = _Linearized(samples, curve.control_points, field, rig, levels, _REFINED_PX)
-    equations = linear.equations(_Reference.of(samples, curve), levels, config, robust=True)
+    equations = linear.equations(_Reference.of(samples, curve), levels, config, _OUTLIER_PX)
     equations.solve()
     residual = _residual([view.pixels for view in linear.views], linear)
     return Fit(curve, samples, linear.offsets, residual, equations.covariance(samples))
@@ -168,7 +172,7 @@ class _Linearized:
         reference: _Reference,
         levels: tuple[float, float],
         config: TrackingConfig,
-        robust: bool,
+        outlier_px: float,
     ) -> _Equations:
         """The normal equations of the next step."""
         equations = _Equations(int(self.samples.first[-1]) + spline.ORDER)
@@ -177,8 +181,7 @@ class _Linearized:
         for view, found, level in zip(self.views, self.offsets, levels, strict=True):
             weight = self._amount(view) / config.noise_px**2
             weight = weight * found.found * np.clip(found.response / level, 0, 1) ** 2
-            if robust:
-                weight = weight / (1 + (found.offset / _OUTLIER_PX) ** 2) ** 2
+            weight = weight / (1 + (found.offset / outlier_px) ** 2) ** 2
             row = (view.normals[:, None, :] @ view.jacobian)[:, 0, :]
             equations.add_scalar(self.samples, 0, row, weight, found.offset)
         return equations

@@ -14,9 +14,12 @@ from suturetrack.initialization import (
     initialize,
 )
 from suturetrack.tracking.config import TrackingConfig
-from suturetrack.tracking.follower import RELIABILITY_SAMPLES, Follower
+from suturetrack.tracking.follower import Follower
+from suturetrack.tracking.recovery import find_again
+from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.types import Energies, RidgeField, Seed, Stamp, Status, ThreadState
 
+_BETWEEN_ATTEMPTS_NS = 150_000_000
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
 
@@ -36,6 +39,8 @@ class _Thread:
     attempts: int
     follower: Follower | None = None
     last: ThreadState | None = None
+    wait_ns: int = 0
+    """Until when the lost thread is not looked for again."""
 
 
 class Tracker:
@@ -72,10 +77,41 @@ class Tracker:
             if thread.follower is None:
                 state = self._find(name, thread, field, initializations)
             else:
-                state = thread.follower.step(field, name)
+                state = self._follow(name, thread, thread.follower, field)
             thread.last = state
             states.append(state)
         return TrackerStep(tuple(states), initializations)
+
+    def _follow(
+        self, name: str, thread: _Thread, follower: Follower, field: RidgeField
+    ) -> ThreadState:
+        if thread.last is not None and field.stamp.capture_ns <= thread.last.stamp.capture_ns:
+            return replace(
+                thread.last, stamp=field.stamp, events=("not newer than the last field",)
+            )
+        state = follower.step(field, name)
+        was_lost = thread.last is not None and thread.last.status is Status.LOST
+        if state.status is not Status.LOST:
+            thread.wait_ns = 0
+            return replace(state, events=("recovered", *state.events)) if was_lost else state
+        if not was_lost:
+            state = replace(state, events=("lost", *state.events))
+        if field.stamp.capture_ns < thread.wait_ns:
+            return state
+        thread.wait_ns = field.stamp.capture_ns + _BETWEEN_ATTEMPTS_NS
+        curve = find_again(
+            follower.last_good,
+            follower.known_length,
+            thread.seed,
+            field,
+            self._rig,
+            self._initialization,
+        )
+        if curve is None:
+            return state
+        thread.follower = Follower(curve, field, self._rig, self._config)
+        state = thread.follower.step(field, name)
+        return replace(state, events=("found again", *state.events))
 
     def _find(
         self,

@@ -1,0 +1,68 @@
+"""Finds a thread again that was lost: from the last curve, then from the last seed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.initialization import InitializationConfig, InitializationError, initialize
+from suturetrack.kernels import search
+from suturetrack.nurbs import evaluate, length, reversed_curve, tangents
+from suturetrack.tracking.sampling import views
+from suturetrack.types import Float64, Nurbs, RidgeField, Seed
+
+_PLACES = 24
+_SEEDS = 2
+_LENGTH_TOLERANCE = 0.1
+
+
+def find_again(
+    last: Nurbs,
+    known_length: float,
+    seed: Seed,
+    field: RidgeField,
+    rig: StereoRig,
+    config: InitializationConfig,
+) -> Nurbs | None:
+    """The thread in the field, run in the direction of the last curve; None where it is not found.
+
+    A curve counts as the thread if its length is the known one.
+    """
+    for start in (*_seeds_on(last, seed.thread, field, rig), seed):
+        try:
+            curve = initialize(field, rig, start, config).curve
+        except InitializationError:
+            continue
+        if abs(length(curve) / known_length - 1) < _LENGTH_TOLERANCE:
+            return _directed(curve, last)
+    return None
+
+
+def _seeds_on(last: Nurbs, thread: str, field: RidgeField, rig: StereoRig) -> list[Seed]:
+    """Where the last curve still lies best on something that looks like thread."""
+    s = np.linspace(0.03, 0.97, _PLACES)
+    points = evaluate(last, s)
+    both = views(rig, points, tangents(last, s))
+    shown = np.minimum(
+        *(
+            search.responses(image, view.pixels, view.tangents)
+            for image, view in zip((field.left, field.right), both, strict=True)
+        )
+    )
+    best = np.argsort(-shown)
+    far = best[np.abs(best - best[0]) > _PLACES // 4]
+    chosen = [best[0], *far[: _SEEDS - 1]]
+    return [
+        Seed(thread, point=(float(p[0]), float(p[1]), float(p[2])))
+        for p, clear in zip(points[chosen], shown[chosen] > 0, strict=True)
+        if clear
+    ]
+
+
+def _directed(curve: Nurbs, last: Nurbs) -> Nurbs:
+    def apart(a: Nurbs) -> float:
+        s: Float64 = np.linspace(0, 1, 16)
+        return float(np.linalg.norm(evaluate(a, s) - evaluate(last, s), axis=1).sum())
+
+    other = reversed_curve(curve)
+    return other if apart(other) < apart(curve) else curve
