@@ -21,7 +21,7 @@ import zenoh
 from zenoh.shm import GarbageCollect, ShmProvider, ZShmMut
 
 from services.bus import Deliver, NoAnswer, Reply
-from services.wire import Packet
+from services.wire import Packet, WireError
 from suturetrack.types import InputError
 
 LISTENERS = ("source", "segmenter", "tracker", "run")
@@ -127,7 +127,8 @@ class ZenohTransport:
 
     Args:
         config: where to listen and to connect.
-        patient: wait for slow readers instead of dropping what they cannot take; for lock-step.
+        patient: nothing may be lost, for lock-step: wait for slow readers instead of dropping what
+            they cannot take, and leave out the shared memory, which is taken back from stalled ones.
 
     Raises:
         InputError: the session cannot be opened.
@@ -139,8 +140,7 @@ class ZenohTransport:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise InputError(_explain(error)) from error
-        control = zenoh.CongestionControl
-        self._congestion = control.BLOCK if patient else control.DROP
+        self._patient = patient
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._kept: list[object] = []
         self._pool: ShmProvider | None = None
@@ -149,7 +149,7 @@ class ZenohTransport:
     def put(self, key: str, packet: Packet, *, large: bool) -> None:
         """See `Transport`."""
         payload = bytes(packet.payload)
-        content = self._share(payload) if large else payload
+        content = self._share(payload) if large and not self._patient else payload
         publisher = self._publisher(key, large=large)
         publisher.put(content, encoding=packet.encoding, attachment=packet.attachment)
 
@@ -239,11 +239,11 @@ class ZenohTransport:
 
     def _publisher(self, key: str, *, large: bool) -> zenoh.Publisher:
         if key not in self._publishers:
-            urgent = zenoh.Priority.INTERACTIVE_HIGH
+            control, priority = zenoh.CongestionControl, zenoh.Priority
             self._publishers[key] = self._session.declare_publisher(
                 key,
-                congestion_control=self._congestion,
-                priority=zenoh.Priority.DATA if large else urgent,
+                congestion_control=control.BLOCK if self._patient else control.DROP,
+                priority=priority.DATA if large else priority.INTERACTIVE_HIGH,
                 express=not large,
                 reliability=zenoh.Reliability.RELIABLE,
             )
@@ -259,11 +259,34 @@ def _make_pool(size: int) -> ShmProvider | None:
         return None
 
 
+class ArrivedPayload:
+    """The content of a message, read out of shared memory when it is asked for."""
+
+    def __init__(self, content: zenoh.ZBytes):
+        self._content = content
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether it came through shared memory."""
+        return self._content.as_shm() is not None
+
+    def __len__(self) -> int:
+        return len(self._content)
+
+    def __bytes__(self) -> bytes:
+        data = self._content.to_bytes()
+        shared = self._content.as_shm()
+        # The sender takes its memory back from a reader that has stalled for too long.
+        if shared is not None and not shared.is_valid():
+            raise WireError("it was read too late: its shared memory had been taken back")
+        return data
+
+
 def _packet(message: zenoh.Sample | zenoh.Query) -> Packet:
     payload, attachment = message.payload, message.attachment
     return Packet(
         str(message.encoding),
-        b"" if payload is None else payload,
+        b"" if payload is None else ArrivedPayload(payload),
         b"" if attachment is None else attachment.to_bytes(),
     )
 

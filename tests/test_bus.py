@@ -7,8 +7,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import psutil
@@ -18,8 +19,9 @@ from services import topics, wire
 from services.bus import Bus, NoAnswer, Transport
 from services.memory_transport import Hub
 from services.messages import SeedReply
-from services.wire import Packet
+from services.wire import Packet, WireError
 from services.zenoh_transport import (
+    ArrivedPayload,
     ZenohTransport,
     load_config,
     local_config,
@@ -325,9 +327,32 @@ def test_a_configuration_file_replaces_the_default(tmp_path: Path) -> None:
         load_config(file)
 
 
+@dataclass
+class Shared:
+    """Stands in for content in shared memory."""
+
+    valid: bool
+
+    def to_bytes(self) -> bytes:
+        return b"perhaps of another frame"
+
+    def as_shm(self) -> Shared:
+        return self
+
+    def is_valid(self) -> bool:
+        return self.valid
+
+
+def test_shared_memory_that_was_taken_back_is_not_believed() -> None:
+    good, bad = (ArrivedPayload(cast(Any, Shared(valid))) for valid in (True, False))
+    assert bytes(good) == b"perhaps of another frame"
+    with pytest.raises(WireError, match="read too late"):
+        bytes(bad)
+
+
 SENDER = """
 import sys
-from services.wire import Packet
+from services.wire import Packet, WireError
 from services.zenoh_transport import ZenohTransport, local_config
 transport = ZenohTransport(local_config("test", "source"))
 while not sys.stdin.closed and sys.stdin.readline():
@@ -365,8 +390,8 @@ SWEEP = "from services.zenoh_transport import sweep_shared_memory; sweep_shared_
 
 
 def _is_shared(packet: Packet) -> bool:
-    payload: Any = packet.payload
-    return payload.as_shm() is not None
+    assert isinstance(packet.payload, ArrivedPayload)
+    return packet.payload.is_shared
 
 
 def _mapped(pid: int) -> set[Path]:
