@@ -44,6 +44,7 @@ VERBS = {
     "compare": _Verb("services.compare", "CompareConfig", "several runs side by side"),
     "export": _Verb("services.export", "ExportConfig", "the states of a run as JSON lines"),
     "view": _Verb("services.view", "ViewConfig", "a run, or what runs now, in the Rerun viewer"),
+    "scenes": _Verb("services.scenes", "ScenesConfig", "pictures of the synthetic bench top"),
     "bench": _Verb("services.bench", "BenchConfig", "accuracy and speed beside references"),
     "source": _Verb("services.source", "SourceConfig", "the process that releases frames", True),
     "segmenter": _Verb(
