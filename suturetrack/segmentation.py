@@ -230,7 +230,7 @@ class _View:
         self._config = config
         self._kernel = gaussian_kernel(config.blur)
         self._channels = [np.empty((height, width), np.uint8) for _ in range(3)]
-        self._vectors = np.empty((2, height, width), np.float32)
+        self._vectors = np.empty((2, height, width + 4), np.float32)
         self._strength = np.empty(((height + 3) // 4, width), np.float32)
         self._outputs = np.empty((_SLOTS, height, width, 2), np.float32)
         self._relative_c: float | None = None

@@ -120,6 +120,20 @@ def test_any_size_and_layout_gives_the_literal_field(
     assert np.linalg.norm(field, axis=-1).max() <= 1 + 1e-6
 
 
+@given(st.integers(0, 2**32 - 1))
+def test_vectors_at_right_angles_are_subtracted(seed: int) -> None:
+    """Algorithm 1 adds where d > 0 and subtracts where d = 0, however the zeros are signed."""
+    rng = np.random.default_rng(seed)
+    choices = np.array([[1, 0], [0, 1], [-0.0, 0.5], [0.25, -0.0], [0, 0], [-1, 0]], np.float32)
+    vectors = choices[rng.integers(0, len(choices), (9, 11))]
+    padded = np.pad(np.moveaxis(vectors, -1, 0), [(0, 0), (0, 0), (2, 2)], mode="edge")
+    # Taps are powers of two, so that both arithmetics are exact.
+    kernel = np.exp2(-np.add.outer(abs(np.arange(-2, 3)), abs(np.arange(-2, 3)))) / 8
+    out = np.empty((9, 11, 2), np.float32)
+    ridge.blur_angles(padded, kernel.astype(np.float32), out)
+    np.testing.assert_array_equal(out, reference.blur_angles(vectors.astype(float), kernel))
+
+
 @given(st.integers(0, 2**32 - 1), st.floats(0.5, 0.999))
 def test_the_quantile_is_numpys(seed: int, share: float) -> None:
     values = np.random.default_rng(seed).gamma(0.5, 30, (40, 64)).astype(np.float32)

@@ -12,6 +12,9 @@ from numba import njit
 from suturetrack.types import Float32, Image
 
 _fast = {"fastmath": {"contract", "nnan", "ninf", "nsz", "arcp"}, "error_model": "numpy"}
+# Without licence to mix up +0 and -0.
+_exact = {"fastmath": {"contract"}, "error_model": "numpy"}
+_sign_bit = np.int32(-(1 << 31))
 _zero, _half, _one, _two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _tiny = np.float32(1e-20)
 
@@ -63,7 +66,7 @@ def ridge_vectors(
         signs: lambda_2 / |lambda_2| must lie in this closed range: (1, 1) finds dark ridges,
             (-1, -1) bright ones, (-1, 1) both.
         keep_longer: whether a vector that `vectors` holds already stays where it is the longer one.
-        vectors: (2, H, W), written: u and v.
+        vectors: (2, H, W + 4), written: u and v, and two replicated columns on both sides.
         strength: (ceil(H / 4), W), written: S^2 of every fourth row, 0 where the sign is refused.
     """
     height, width = plane.shape
@@ -82,8 +85,11 @@ def ridge_vectors(
         _vertical_derivatives(plane, row, slope, curve, padded[1:])
         _smooth_row(padded[2], smooth, hessian[2])
         _first_difference(padded[1], slope, hessian[1])
-        u, v = vectors[0, row], vectors[1, row]
+        u, v = vectors[0, row, 2:], vectors[1, row, 2:]
         _ridge_row(hessian, shape, signs, keep_longer, u, v, strength[row // 4])
+        for line in vectors[:, row]:
+            line[0] = line[1] = line[2]
+            line[width + 2] = line[width + 3] = line[width + 1]
 
 
 @njit(cache=True, **_fast)
@@ -237,34 +243,31 @@ def blur_angles(vectors: Float32, kernel: Float32, out: Float32) -> None:
     """Algorithm 1, taps in raster order, edges replicated.
 
     Args:
-        vectors: (2, H, W), V_r.
+        vectors: (2, H, W + 4), V_r and two replicated columns on both sides.
         kernel: (5, 5), G.
         out: (H, W, 2), written: V_o.
     """
-    _, height, width = vectors.shape
-    ring = np.empty((5, 2, width + 4), np.float32)
+    height, width, _ = out.shape
     sums = np.empty((2, width), np.float32)
-    for y in range(-2, height + 2):
-        line = ring[(y + 2) % 5]
+    for row in range(height):
         for axis in range(2):
-            _pad(vectors[axis, min(max(y, 0), height - 1)], 2, line[axis])
-        row = y - 2
-        if row < 0:
-            continue
-        centre = ring[(row + 2) % 5]
-        for axis in range(2):
+            centre, total = vectors[axis, row, 2:], sums[axis]
             for x in range(width):
-                sums[axis, x] = kernel[2, 2] * centre[axis, x + 2]
+                total[x] = kernel[2, 2] * centre[x]
         for k in range(5):
-            _add_taps(ring[(row + k) % 5], kernel[k], k == 2, sums)
+            beside = min(max(row + k - 2, 0), height - 1)
+            u, v = vectors[0, beside], vectors[1, beside]
+            _add_taps(u, v, kernel[k], k == 2, sums[0], sums[1])
+        line, u, v = out[row], sums[0], sums[1]
         for x in range(width):
-            out[row, x, 0] = sums[0, x]
-            out[row, x, 1] = sums[1, x]
+            line[x, 0] = u[x]
+            line[x, 1] = v[x]
 
 
-@njit(cache=True, **_fast)
-def _add_taps(line: Float32, taps: Float32, skip_centre: bool, sums: Float32) -> None:
-    u, v, sum_u, sum_v = line[0], line[1], sums[0], sums[1]
+@njit(cache=True, **_exact)
+def _add_taps(
+    u: Float32, v: Float32, taps: Float32, skip_centre: bool, sum_u: Float32, sum_v: Float32
+) -> None:
     t0, t1, t2, t3, t4 = taps
     if skip_centre:
         t2 = _zero
@@ -276,9 +279,12 @@ def _add_taps(line: Float32, taps: Float32, skip_centre: bool, sums: Float32) ->
         sum_u[x], sum_v[x] = _add_tap(a, b, u[x + 4], v[x + 4], t4)
 
 
-@njit(inline="always", **_fast)
+@njit(inline="always", **_exact)
 def _add_tap(a: Any, b: Any, u: Any, v: Any, tap: Any) -> Any:
-    signed = tap if a * u + b * v > _zero else -tap
+    # -d, and +0 where d = 0: its sign bit says whether to add.
+    minus_d = (_zero - a * u) - b * v
+    flip = np.int32(np.float32(minus_d).view(np.int32) & _sign_bit)
+    signed = np.int32(np.float32(-tap).view(np.int32) ^ flip).view(np.float32)
     return a + signed * u, b + signed * v
 
 
