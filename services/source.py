@@ -19,6 +19,8 @@ from suturetrack.types import InputError, Stamp, StereoFrame
 
 _LONGEST_STEP_S = 60.0
 """Lock-step: how long the others may take for one frame."""
+_BUFFERED = 4
+"""How many frames may be late before some are skipped, as in the buffer of a camera's driver."""
 _LAST_STEP_S = 2.0
 """In real time: how long the last frame may take to go through."""
 
@@ -72,7 +74,10 @@ def run(service: Service, config: SourceConfig) -> None:
 
 
 class _Pace:
-    """Gives every frame when it is due; skips those whose time has passed, but in lock-step none."""
+    """Gives every frame when it is due, catches up when late, and skips frames when too late.
+
+    In lock-step nothing is skipped and nothing waits for its time.
+    """
 
     def __init__(self, service: Service, footage: Footage, frames: int | None):
         self._service, self._footage = service, footage
@@ -101,7 +106,7 @@ class _Pace:
 
     def _skip(self) -> None:
         due = int((time.monotonic() - self._began) * self._footage.fps)
-        if due > self._index:
+        if due > self._index + _BUFFERED:
             self._service.meter.skipped += due - self._index
             self._index = due
 
