@@ -42,6 +42,7 @@ VERBS = {
     ),
     "inspect": _Verb("services.inspect", "InspectConfig", "tables of a run"),
     "compare": _Verb("services.compare", "CompareConfig", "several runs side by side"),
+    "replay": _Verb("services.replay", "ReplayConfig", "a run once more through today's code"),
     "export": _Verb("services.export", "ExportConfig", "the states of a run as JSON lines"),
     "view": _Verb("services.view", "ViewConfig", "a run, or what runs now, in the Rerun viewer"),
     "scenes": _Verb("services.scenes", "ScenesConfig", "pictures of the synthetic bench top"),

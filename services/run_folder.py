@@ -8,7 +8,7 @@ import sys
 import tempfile
 import warnings
 import weakref
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from services.recording import APPLICATION, RECORDING_VERSION
@@ -26,8 +27,10 @@ from suturetrack.types import (
     Image,
     InputError,
     Nurbs,
+    RidgeField,
     Stamp,
     Status,
+    StereoFrame,
     ThreadState,
     Truth,
 )
@@ -66,7 +69,7 @@ class RunFolder:
         self.problems: list[str] = []
         if not self.path.is_dir():
             raise InputError(f"no run folder {self.path}; it is what `--run-dir` named")
-        files = sorted(self.path.glob("*.rrd"))
+        files = sorted(self.path.glob("*.rrd"), key=_part)
         if not files:
             raise InputError(f"{self.path}: no recordings (*.rrd) in this folder")
         readers = {file: self._open(file) for file in files}
@@ -113,6 +116,32 @@ class RunFolder:
                 values[:, 0] if values.shape[1] == 1 else values,
             )
         return series
+
+    def frames(self) -> Iterator[StereoFrame]:
+        """All recorded frames in order, each read when it is asked for; not released yet (0)."""
+        for stamp, left, right in self._pairs("image", _image):
+            yield StereoFrame(stamp, left, right)
+
+    def fields(self) -> Iterator[RidgeField]:
+        """All fields of a full recording in order, each read when it is asked for."""
+        for stamp, left, right in self._pairs("field", _field):
+            yield RidgeField(stamp, left, right)
+
+    def _pairs(
+        self, name: str, read: Callable[[Row], NDArray[Any] | None]
+    ) -> Iterator[tuple[Stamp, NDArray[Any], NDArray[Any]]]:
+        """What both views recorded under a name, by frame; chunks come in the order of time."""
+        waiting: dict[int, NDArray[Any]] = {}
+        for row in self.rows(f"/rig/left/{name}", f"/rig/right/{name}"):
+            picture = read(row)
+            if picture is None:
+                continue
+            other = waiting.pop(row["frame"], None)
+            if other is None:
+                waiting[row["frame"]] = picture
+            else:
+                pair = (picture, other) if "/left/" in row["entity"] else (other, picture)
+                yield (Stamp(row["frame"], row["capture"], 0), *pair)
 
     def images(self, frames: Container[int]) -> dict[tuple[int, str], Image]:
         """The raw images of some frames, by frame and view ("left", "right"); BGR or gray."""
@@ -231,6 +260,18 @@ def _image(row: Row) -> Image | None:
         pixels = np.asarray(row["Image:buffer"][0], np.uint8)
         return pixels.reshape(form["height"], form["width"], -1).squeeze()
     return None
+
+
+def _field(row: Row) -> NDArray[Any] | None:
+    if "RidgeField:vectors" not in row:
+        return None
+    return row["RidgeField:vectors"].reshape(row["RidgeField:shape"])
+
+
+def _part(file: Path) -> tuple[str, int]:
+    """Sorts the parts of a process by their numbers."""
+    process, _, number = file.stem.partition(".")
+    return process, int(number) if number.isdecimal() else 0
 
 
 def _stamp(row: Row, kind: str) -> Stamp:

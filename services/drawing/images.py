@@ -64,7 +64,9 @@ def field(field: RidgeField, rig: StereoRig, level: Level) -> Iterator[Entry]:
         picture = unrectified(direction_image(vectors), rig, view)
         yield f"/rig/{view}/image/direction", jpeg(picture)
         if level == "full":
-            yield f"/rig/{view}/field", rr.Tensor(vectors, dim_names=("v", "u", "component"))
+            # A copy, because the segmenter uses its buffers again before they are written.
+            numbers = {"shape": vectors.shape, "vectors": vectors.copy()}
+            yield f"/rig/{view}/field", values("RidgeField", numbers)
 
 
 def process_style(process: str) -> Iterator[Entry]:
