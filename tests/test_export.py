@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rerun as rr
 
 from services.export import ExportConfig, run
 from services.recording import Recorder
@@ -139,3 +140,22 @@ def test_an_output_that_cannot_be_written_is_named(
     record(tmp_path, rig, [make_state(curve, 0)])
     with pytest.raises(InputError, match="cannot write"):
         run(ExportConfig(tmp_path, tmp_path / "missing" / "states.jsonl"))
+
+
+def test_recordings_of_others_and_of_the_future_are_named(
+    tmp_path: Path,
+    rig: StereoRig,
+    curve: Nurbs,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("services.recording.RECORDING_VERSION", 7)
+    record(tmp_path, rig, [make_state(curve, i) for i in range(3)])
+    stream = rr.RecordingStream("another_program")
+    stream.set_sinks(rr.FileSink(str(tmp_path / "other.rrd")))
+    stream.log("x", rr.Scalars(1.0))
+    stream.disconnect()
+    assert len(exported(tmp_path)) == 3
+    said = capsys.readouterr().err
+    assert "other.rrd is a recording of another_program" in said
+    assert "recorded by a newer suturetrack (version 7" in said
