@@ -5,11 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
+from scipy.stats import spearmanr
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
-from suturetrack.metrics import curve_error
+from suturetrack.metrics import curve_error, polyline_distances
 from suturetrack.segmentation import Segmenter
 from suturetrack.types import (
     Float64,
@@ -21,6 +23,7 @@ from suturetrack.types import (
     Stamp,
     StereoFrame,
 )
+from tests.conftest import make_rig
 
 STAMP = Stamp(0, 0, 0)
 
@@ -95,3 +98,106 @@ def test_growth_tells_what_was_reached_and_marked(rig: StereoRig, curve: Nurbs) 
     assert np.isfinite(left.cost).sum() > 1000
     spacing = np.linalg.norm(np.diff(found.growth.marks[:, 0], axis=0), axis=1)
     assert abs(np.median(spacing) - 6) < 0.5
+
+
+def test_any_seed_gives_the_same_curve(rig: StereoRig, curve: Nurbs) -> None:
+    field, truth = field_of_curve(curve, rig), dense(curve)
+    pixels = rig.project(truth)[0]
+    rng = np.random.default_rng(3)
+    middle = initialize(field, rig, Seed(pixel=tuple(pixels[700])))
+    reference = rig.project(dense(middle.curve, 400))[0]
+    for k in (12, 300, 1000, 1488):
+        seed = pixels[k] + rng.uniform(-1, 1, 2) * 3
+        found = initialize(field, rig, Seed(pixel=tuple(seed)))
+        here = rig.project(dense(found.curve, 400))[0]
+        assert polyline_distances(here, reference).max() < 0.5
+        assert polyline_distances(reference, here).max() < 0.5
+
+
+def test_a_seed_in_space_is_as_good_as_a_pixel(rig: StereoRig, curve: Nurbs) -> None:
+    field, point = field_of_curve(curve, rig), dense(curve)[700]
+    by_point = initialize(field, rig, Seed(point=tuple(point)))
+    by_pixel = initialize(field, rig, Seed(pixel=tuple(rig.project(point)[0])))
+    np.testing.assert_allclose(by_point.curve.control_points, by_pixel.curve.control_points)
+
+
+def test_a_seed_beside_the_thread_snaps_to_it(rig: StereoRig, curve: Nurbs) -> None:
+    field, pixels = field_of_curve(curve, rig), rig.project(dense(curve))[0]
+    along = pixels[701] - pixels[699]
+    aside = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    near = initialize(field, rig, Seed(pixel=tuple(pixels[700] + 7.5 * aside)))
+    on = initialize(field, rig, Seed(pixel=tuple(pixels[700])))
+    np.testing.assert_allclose(near.curve.control_points, on.curve.control_points, atol=1e-6)
+
+
+def figure_eight() -> Float64:
+    """A thread that crosses itself once, 195 mm before the camera, with relief."""
+    t = np.linspace(0.35, 2 * np.pi - 0.35, 3000) + np.pi / 2
+    return np.c_[10 + 28 * np.cos(t), 22 * np.sin(2 * t), 195 + 8 * np.sin(t + 0.4)]
+
+
+def test_a_crossing_is_passed_straight_on(rig: StereoRig) -> None:
+    truth = figure_eight()
+    left, right = rig.project(truth)
+    field = field_of(draw(left, rig), draw(right, rig), rig)
+    found = initialize(field, rig, Seed(pixel=tuple(left[500])))
+    points = dense(found.curve, 3000)
+    error = curve_error(points, truth)
+    assert error.rms < 0.5
+    assert abs(error.length_percent) < 2
+    assert max(error.ends) < 1.5
+    nearest = cKDTree(truth).query(points[::100])[1]
+    straight = np.array([n for n in nearest if np.linalg.norm(truth[n] - truth[1500]) > 15])
+    assert len(straight) > 10
+    assert abs(spearmanr(straight, np.arange(len(straight))).statistic) > 0.99
+
+
+def test_a_highlight_is_bridged(rig: StereoRig, curve: Nurbs) -> None:
+    truth = dense(curve)
+    views = []
+    for pixels in rig.project(truth):
+        dark = draw(pixels[:600], rig)
+        views.append(draw(pixels[640:], rig, dark))
+    found = initialize(field_of(*views, rig), rig, Seed(pixel=tuple(rig.project(truth[900])[0])))
+    assert len(found.growth.left.merges) == 1
+    assert abs(curve_error(dense(found.curve), truth).length_percent) < 2
+
+
+def test_straight_stretches_take_few_control_points(rig: StereoRig) -> None:
+    line = np.linspace([-30.0, -25, 190], [40.0, 30, 205], 1500)
+    left, right = rig.project(line)
+    field = field_of(draw(left, rig), draw(right, rig), rig)
+    found = initialize(field, rig, Seed(pixel=tuple(left[700])))
+    assert len(found.curve.control_points) <= 8
+    assert curve_error(dense(found.curve), line).rms < 0.1
+
+
+def test_ends_cut_by_the_border_are_reported(rig: StereoRig) -> None:
+    line = np.linspace([-20.0, -25, 190], [100.0, 30, 205], 1500)
+    left, right = rig.project(line)
+    inside = left[np.all((left > 0) & (left < [639, 479]), axis=1)]
+    field = field_of(draw(left, rig), draw(right, rig), rig)
+    found = initialize(field, rig, Seed(pixel=tuple(inside[len(inside) // 2])))
+    assert any("cut by the image border" in reason for reason in found.reasons)
+
+
+def test_views_that_disagree_lower_the_confidence(rig: StereoRig, curve: Nurbs) -> None:
+    left, right = rig.project(dense(curve))
+    whole = draw(left, rig), draw(right, rig)
+    sure = initialize(field_of(*whole, rig), rig, Seed(pixel=tuple(left[700])))
+    half = draw(right[:1100], rig)
+    unsure = initialize(field_of(whole[0], half, rig), rig, Seed(pixel=tuple(left[700])))
+    assert unsure.confidence < 0.5 < sure.confidence
+    assert any("agree" in reason for reason in unsure.reasons)
+
+
+@pytest.mark.parametrize("baseline", [0.04, 4000.0])
+def test_the_unit_does_not_matter(rig: StereoRig, curve: Nurbs, baseline: float) -> None:
+    other, scale = make_rig(baseline=baseline), baseline / rig.baseline
+    seed = Seed(pixel=tuple(rig.project(dense(curve))[0][700]))
+    field = field_of_curve(curve, rig)
+    here, there = initialize(field, rig, seed), initialize(field, other, seed)
+    np.testing.assert_allclose(
+        there.curve.control_points / scale, here.curve.control_points, rtol=1e-6, atol=1e-6
+    )
+    assert there.confidence == pytest.approx(here.confidence)

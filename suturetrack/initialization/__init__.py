@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from suturetrack.camera import StereoRig
+from suturetrack.initialization.confidence import judge
 from suturetrack.initialization.ends import move_end, read_end
 from suturetrack.initialization.fitting import fit_marks, image_parameters, refine
-from suturetrack.initialization.growth import grow_thread, nearest_segment
+from suturetrack.initialization.growth import Chain, grow_thread, nearest_segment
 from suturetrack.initialization.matching import match
 from suturetrack.initialization.model import (
     Growth,
@@ -29,6 +30,7 @@ __all__ = [
 ]
 
 
+_SHORTEST_STEPS = 4
 _LEAST_MATCH = 0.35
 """Median response of the right view, against the left one, below which it shows another scene."""
 
@@ -52,25 +54,22 @@ def initialize(
         raise InitializationError(_nothing_there(candidates, pixel, config), candidates)
     chain, left = grow_thread(ridges[0], origin, pixel, config)
     matched = match(chain, field.left, field.right, rig)
-    right = _right_growth(ridges[1], matched.right, config)
+    right_chain, right = _right_growth(ridges[1], matched.right, config)
     step = max(1, round(config.step_px))
     marks = np.stack([chain.pixels[::step], matched.right[::step]], axis=1)
     growth = Growth(left, right, marks)
-    response = float(np.median(matched.response))
-    if response < _LEAST_MATCH or len(chain.pixels) < 4 * step:
-        reason = "the right view shows no thread along the epipolar lines of the left one"
-        if len(chain.pixels) < 4 * step:
-            reason = f"the ridge at the seed is only {len(chain.pixels)} px long"
+    if len(chain.pixels) < _SHORTEST_STEPS * step:
+        reason = f"the ridge at the seed is only {len(chain.pixels)} px long"
         raise InitializationError(reason, candidates, growth)
+    if np.median(matched.response) < _LEAST_MATCH:
+        raise InitializationError(_no_match(chain, field, rig), candidates, growth)
     pixels = _trim(np.c_[chain.pixels, matched.right], field)
     s = image_parameters(pixels[:, :2], pixels[:, 2:])
     points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
     curve = fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
     curve, samples = refine(curve, (field.left, field.right), rig)
-    crests = samples.crests
-    residual = float(np.mean([np.average(abs(c.offsets), weights=c.trust + 1e-9) for c in crests]))
-    seen = float(np.mean([(c.response > config.low).mean() for c in crests]))
-    return Initialization(curve, seen, (), residual, growth)
+    confidence, reasons = judge(curve, samples, (chain, right_chain), rig)
+    return Initialization(curve, confidence, reasons, samples.distance_px, growth)
 
 
 def seed_pixel(seed: Seed, rig: StereoRig) -> Float64:
@@ -104,13 +103,24 @@ def _trim(pixels: Float64, field: RidgeField) -> Float64:
     return pixels
 
 
-def _right_growth(ridges: Ridges, pixels: Float64, config: InitializationConfig) -> ViewGrowth:
+def _right_growth(
+    ridges: Ridges, pixels: Float64, config: InitializationConfig
+) -> tuple[Chain, ViewGrowth]:
     middle = pixels[len(pixels) // 2]
     origin, _ = nearest_segment(ridges, middle, np.inf)
     if origin is None:
         cost = np.full(ridges.magnitude.shape, np.inf, np.float32)
-        return ViewGrowth(cost, (), np.empty((0, 2, 2)), ())
-    return grow_thread(ridges, origin, middle, config)[1]
+        nothing = Chain(np.empty((0, 2)), np.empty(0, bool))
+        return nothing, ViewGrowth(cost, (), np.empty((0, 2, 2)), ())
+    return grow_thread(ridges, origin, middle, config)
+
+
+def _no_match(chain: Chain, field: RidgeField, rig: StereoRig) -> str:
+    reason = "the right view shows no thread along the epipolar lines of the left one"
+    swapped = match(chain, field.left, field.right, rig, swapped=True)
+    if np.median(swapped.response) >= _LEAST_MATCH:
+        reason += ", but it does on the other side: left and right are swapped"
+    return reason
 
 
 def _nothing_there(candidates: Float64, pixel: Float64, config: InitializationConfig) -> str:

@@ -31,6 +31,7 @@ _STAY = 0.01
 _UNSEEN = 0.02
 """Trust in a crest below which a view does not see the thread."""
 _STIFFEST = 1e9
+_RIDGE = 1e-9
 _END_NOISE_PX = 0.2
 _LARGEST_END_STEP_PX = 2.0
 _BEND_SAMPLES = 8.0
@@ -49,7 +50,7 @@ def image_parameters(left: Float64, right: Float64) -> Float64:
 def fit_marks(points: Float64, s: Float64, spans: int) -> Nurbs:
     """Least-squares curve through (k, 3) stereo points at parameters `s` (end of Section V)."""
     knots = nurbs.clamped_knots(np.linspace(0, 1, spans + 1)[1:-1], DEGREE)
-    return nurbs.fit(points, s, knots, DEGREE, smoothing=1e-9)
+    return _closest(knots, s, points, np.tile(np.eye(3), (len(s), 1, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +102,13 @@ class Samples:
         )
 
     @property
+    def distance_px(self) -> float:
+        """Mean distance from curve to crest, both views, px."""
+        weights = np.concatenate([c.trust for c in self.crests])
+        offsets = np.concatenate([np.abs(c.offsets) for c in self.crests])
+        return float((weights * offsets).sum() / max(weights.sum(), 1e-9))
+
+    @property
     def noise_px(self) -> float:
         """Root mean square of the offsets from curve to crest, px."""
         squares = sum((c.trust * c.offsets**2).sum() for c in self.crests)
@@ -137,7 +145,9 @@ def with_needed_knots(samples: Samples) -> Nurbs:
     noise = max(samples.noise_px, _LEAST_NOISE_PX) ** 2
     interior = np.array([0.5])
     while True:
-        curve = _closest(nurbs.clamped_knots(interior, DEGREE), samples, information)
+        curve = _closest(
+            nurbs.clamped_knots(interior, DEGREE), samples.s, samples.points, information
+        )
         moved = nurbs.evaluate(curve, samples.s) - samples.points
         excess = np.zeros(len(samples.s))
         for crest, jacobian in zip(samples.crests, samples.jacobians, strict=True):
@@ -162,17 +172,18 @@ def _splits(s: Float64, excess: Float64, interior: Float64) -> list[float]:
     return new
 
 
-def _closest(knots: Float64, samples: Samples, information: Float64) -> Nurbs:
-    """The curve closest to the samples where (k, 3, 3) `information` says that it matters."""
-    first, table = spline.local_basis(samples.s, knots)
+def _closest(knots: Float64, s: Float64, points: Float64, information: Float64) -> Nurbs:
+    """The curve closest to (k, 3) points where (k, 3, 3) `information` says that it matters."""
+    first, table = spline.local_basis(s, knots)
     count = len(knots) - DEGREE - 1
     band, gradient = np.zeros((3 * count, spline.BANDWIDTH)), np.zeros(3 * count)
-    pull = np.einsum("kij,kj->ki", information, samples.points)
+    pull = np.einsum("kij,kj->ki", information, points)
     spline.add_rows(first, table[0], information, pull, band, gradient)
+    band[:, 0] *= 1 + _RIDGE
     if not spline.factorize(band):
         raise FloatingPointError("the samples do not hold the curve")
-    points = spline.solve_factorized(band, gradient).reshape(-1, 3)
-    return nurbs.curve_from(DEGREE, knots, points)
+    control_points = spline.solve_factorized(band, gradient).reshape(-1, 3)
+    return nurbs.curve_from(DEGREE, knots, control_points)
 
 
 def _step(curve: Nurbs, samples: Samples, stiffness: Float64) -> tuple[Nurbs, Float64]:

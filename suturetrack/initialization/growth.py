@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -25,6 +25,8 @@ class Chain:
     """(k, 2) about one pixel apart."""
     seen: Bool
     """(k,) False where a gap was bridged."""
+    doubts: tuple[tuple[Float64, str, float], ...] = ()
+    """Pixels (2,) where the thread may run another way, why, and the confidence that this leaves."""
 
 
 def nearest_segment(ridges: Ridges, seed: Float64, reach: float) -> tuple[int | None, Float64]:
@@ -47,7 +49,8 @@ def grow_thread(
     ridges: Ridges, origin: int, seed: Float64, config: InitializationConfig
 ) -> tuple[Chain, ViewGrowth]:
     """Grows by eq. (3) from the seed on segment `origin` and follows the merged segments."""
-    entries = follow(origin, merge_ends(ridges, config))
+    merged = merge_ends(ridges, config)
+    entries = follow(origin, merged.partner)
     entries = _without_faint_ends(ridges, entries, origin)
     on_thread = [e // 2 for e in entries]
     pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
@@ -61,7 +64,10 @@ def grow_thread(
     )
     segments = tuple(ridges.segments[k] for k in reached)
     view = ViewGrowth(cost, segments, merges.reshape(-1, 2, 2), rejected)
-    return _join(pieces), view
+    doubts = tuple(
+        (ridges.segments[e // 2][-(e % 2)], why, rest) for e, why, rest in merged.doubts(entries)
+    )
+    return replace(_join(pieces), doubts=doubts), view
 
 
 def _without_faint_ends(ridges: Ridges, entries: list[int], origin: int) -> list[int]:

@@ -32,7 +32,9 @@ class Match:
     """(k,) how much the right view looks like thread there: 1 as much as the left one."""
 
 
-def match(chain: Chain, left: Float32, right: Float32, rig: StereoRig) -> Match:
+def match(
+    chain: Chain, left: Float32, right: Float32, rig: StereoRig, swapped: bool = False
+) -> Match:
     """Finds the thread of the left chain in the right view along the epipolar lines.
 
     Args:
@@ -40,10 +42,13 @@ def match(chain: Chain, left: Float32, right: Float32, rig: StereoRig) -> Match:
         left: (H, W, 2) left field.
         right: (H, W, 2) right field.
         rig: the cameras.
+        swapped: look where the thread would be if the views had been taken for each other.
     """
     offset = rig.left.projection[0, 2] - rig.right.projection[0, 2]
-    first = min(offset, 0.0)
+    first = offset
     count = int((right.shape[1] - first) / _STATE_PX)
+    if swapped:
+        first = offset - _STATE_PX * count
     tangents = chain_tangents(chain.pixels)
     level = float(np.median(search.responses(left, chain.pixels, tangents)))
     costs = kernel.matching_costs(

@@ -23,8 +23,6 @@ class InitializationConfig:
     """How far from the thread the seed may be, px."""
     gap_px: float = 25.0
     """Longest gap in the ridge that is bridged, px."""
-    merge_angle_deg: float = 60.0
-    """Turn at which the ends of two segments no longer match."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,8 @@ _TOUCHING_PX = 6.0
 _BRIDGE_SAMPLES = 12
 _SWING = 0.01
 """Price of a bridge that bends one way and then the other."""
+_LEAD = 0.1
+"""How much cheaper than its best rival a merge must be to be beyond doubt."""
 _FREE_END = 0.5
 """Price of an end without a partner: two of them make the highest price of a merge."""
 
@@ -38,10 +40,41 @@ class Merge:
     """(m,) whether ridge joins the two ends, whatever their angle."""
 
 
-def merge_ends(ridges: Ridges, config: InitializationConfig) -> dict[int, int]:
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """Which ends were joined, and what that cost."""
+
+    partner: dict[int, int]
+    """The end that each joined end was joined to."""
+    price: dict[tuple[int, int], float]
+    """Of every pair of ends within reach."""
+
+    def doubts(self, entries: list[int]) -> list[tuple[int, str, float]]:
+        """What is doubtful about the thread that enters its segments at `entries`: at which end, why,
+        and what that leaves of the confidence."""
+        best: dict[int, list[tuple[float, int]]] = {}
+        for (i, j), price in self.price.items():
+            best.setdefault(i, []).append((price, j))
+        found = []
+        for entry in entries[1:]:
+            other = self.partner[entry]
+            price = self.price[entry, other]
+            rivals = [p for e in (entry, other) for p, j in best[e] if j not in (entry, other)]
+            lead = min(rivals, default=2.0) - price
+            if price >= 2 * _FREE_END:
+                found.append((entry, "a sharp bend", 0.6))
+            elif lead < _LEAD:
+                found.append((entry, "an ambiguous crossing", 0.9 if lead > 0 else 0.7))
+        for tip in (entries[0], entries[-1] ^ 1):
+            if min((p for p, _ in best.get(tip, [])), default=2.0) < _FREE_END:
+                found.append((tip, "an end beside other ridges", 0.5))
+        return found
+
+
+def merge_ends(ridges: Ridges, config: InitializationConfig) -> Merged:
     """Pairs up the ends so that all merges and free ends together cost least (almost: by exchange)."""
     if not ridges.segments:
-        return {}
+        return Merged({}, {})
     merges = price_merges(ridges, config)
     price = {
         (int(i), int(j)): float(c) for (i, j), c in zip(merges.pairs, merges.cost, strict=True)
@@ -52,7 +85,7 @@ def merge_ends(ridges: Ridges, config: InitializationConfig) -> dict[int, int]:
     _pair(partner, merges.pairs[order[merges.cost[order] < 1]])
     _exchange(partner, price)
     _pair(partner, merges.pairs[order[merges.touching[order]]])
-    return partner
+    return Merged(partner, price)
 
 
 def follow(start: int, partner: dict[int, int]) -> list[int]:

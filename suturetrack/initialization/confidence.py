@@ -1,0 +1,75 @@
+"""How far a first curve can be relied on, and why."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from suturetrack import nurbs
+from suturetrack.camera import StereoRig
+from suturetrack.initialization.fitting import Samples
+from suturetrack.initialization.growth import Chain
+from suturetrack.metrics import coverage
+from suturetrack.types import Float64, Nurbs
+
+_NEAR_PX = 3.0
+_SEEN = 0.1
+"""Response from which a crest counts as seen."""
+_SAME_PLACE_PX = 25.0
+
+
+def judge(
+    curve: Nurbs, samples: Samples, chains: tuple[Chain, Chain], rig: StereoRig
+) -> tuple[float, tuple[str, ...]]:
+    """Confidence in [0, 1] and its reasons.
+
+    Args:
+        curve: the result.
+        samples: what the images say beside it.
+        chains: the thread as each view by itself has it; their agreement is what counts most.
+        rig: the cameras.
+    """
+    reasons = []
+    pixels = rig.project(nurbs.evaluate(curve, np.linspace(0, 1, 8 * len(curve.control_points))))
+    agreement = min(
+        _agreement(p, chain.pixels, rig) for p, chain in zip(pixels, chains, strict=True)
+    )
+    if agreement < 0.95:
+        reasons.append(f"left and right view agree about {agreement:.0%} of the thread only")
+    seen = float(np.mean([(c.response > _SEEN).mean() for c in samples.crests]))
+    if seen < 0.95:
+        reasons.append(f"uncertain stretches: {1 - seen:.0%} of the thread is not seen")
+    confidence = agreement**2 * seen
+    lowest = 1.0
+    for name, chain in zip(("left", "right"), chains, strict=True):
+        doubts = _distinct(chain)
+        lowest = min(lowest, float(np.prod([rest for *_, rest in doubts])))
+        reasons += [f"{why} in the {name} view at ({u:.0f}, {v:.0f})" for (u, v), why, _ in doubts]
+    confidence *= lowest
+    for end in (0, 1):
+        readings = [samples.ends[view][end] for view in (0, 1)]
+        if any(r.at_border for r in readings):
+            reasons.append(f"{_ORDINAL[end]} end cut by the image border")
+        elif all(np.isnan(r.offset_px) for r in readings):
+            confidence *= 0.7
+            reasons.append(f"{_ORDINAL[end]} end not seen as an end")
+    return float(confidence), tuple(reasons)
+
+
+_ORDINAL = ("first", "last")
+
+
+def _distinct(chain: Chain) -> list[tuple[Float64, str, float]]:
+    """The doubts, the gravest first, one for each place."""
+    kept: list[tuple[Float64, str, float]] = []
+    for doubt in sorted(chain.doubts, key=lambda d: d[2]):
+        if all(np.linalg.norm(doubt[0] - other[0]) > _SAME_PLACE_PX for other in kept):
+            kept.append(doubt)
+    return kept
+
+
+def _agreement(pixels: Float64, chain: Float64, rig: StereoRig) -> float:
+    """The lesser share, of the projected curve inside the image and of the chain, near the other."""
+    inside = ((pixels >= 0) & (pixels <= np.array(rig.image_size) - 1)).all(1)
+    if len(chain) < 2 or inside.sum() < 2:
+        return 0.0
+    return min(coverage(chain, pixels[inside], _NEAR_PX), coverage(pixels, chain, _NEAR_PX))

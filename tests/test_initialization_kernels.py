@@ -1,0 +1,97 @@
+"""The kernels of the initialisation against their literal twins and against scikit-image."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from skimage.measure import euler_number, label
+
+from suturetrack.kernels import crest, growth, matching
+from tests.reference import growth as reference
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_growth_has_the_cost_of_eq_3(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    magnitude = rng.uniform(0, 1, (14, 17)).astype(np.float32)
+    cost = np.full(magnitude.shape, np.inf, np.float32)
+    growth.grow(magnitude, 8, 6, 0.0, 2.0, 0.3, cost)
+    expected = reference.grow(magnitude, 8, 6, 2.0, 0.3)
+    np.testing.assert_array_equal(np.isfinite(cost), np.isfinite(expected))
+    assert np.isfinite(cost).sum() > 50
+    np.testing.assert_allclose(cost, expected, rtol=1e-4)
+
+
+def test_growth_goes_on_from_a_second_origin_where_that_is_cheaper() -> None:
+    magnitude = np.ones((5, 40), np.float32)
+    magnitude[:, 20] = 0
+    cost = np.full(magnitude.shape, np.inf, np.float32)
+    growth.grow(magnitude, 0, 2, 0.0, 2.0, 0.1, cost)
+    assert np.isinf(cost[:, 20:]).all()
+    growth.grow(magnitude, 21, 2, 30.0, 2.0, 0.1, cost)
+    assert cost[2, 39] == pytest.approx(48.0)
+    assert cost[2, 10] == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_cheapest_path_is_the_cheapest_of_all(seed: int) -> None:
+    costs = np.random.default_rng(seed).uniform(0, 1, (6, 4)).astype(np.float32)
+    states, total = matching.cheapest_path(costs, 1, 0.2)
+    paths = itertools.product(range(4), repeat=6)
+    possible = (p for p in paths if all(abs(a - b) <= 1 for a, b in itertools.pairwise(p)))
+    best = min(reference.path_cost(costs, p, 0.2) for p in possible)
+    assert total == pytest.approx(best, abs=1e-5)
+    assert reference.path_cost(costs, tuple(states), 0.2) == pytest.approx(best, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_thinning_keeps_the_topology_and_leaves_nothing_to_thin(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mask = np.zeros((40, 40), bool)
+    for _ in range(6):
+        y, x = rng.integers(4, 30, 2)
+        mask[y : y + rng.integers(2, 8), x : x + rng.integers(2, 8)] = True
+    thinned = mask.copy()
+    crest.thin(thinned, rng.uniform(0, 1, mask.shape).astype(np.float32))
+    assert not (thinned & ~mask).any()
+    assert thinned.sum() < mask.sum()
+    assert label(thinned, connectivity=2).max() == label(mask, connectivity=2).max()
+    assert euler_number(thinned, connectivity=2) == euler_number(mask, connectivity=2)
+    again = thinned.copy()
+    crest.thin(again, np.ones(mask.shape, np.float32))
+    np.testing.assert_array_equal(again, thinned)
+
+
+def test_chains_end_at_junctions_and_hold_every_other_pixel_once() -> None:
+    mask = np.zeros((30, 30), bool)
+    mask[15, 3:27] = True
+    mask[5:15, 14] = True
+    pixels, starts = crest.trace_chains(mask)
+    chains = [pixels[a:b] for a, b in itertools.pairwise(starts)]
+    assert len(chains) == 3
+    assert len({tuple(p) for p in pixels.tolist()}) == len(pixels)
+    assert mask[pixels[:, 1], pixels[:, 0]].all()
+    assert len(pixels) >= mask.sum() - 5
+    for chain in chains:
+        assert abs(np.diff(chain, axis=0)).max() == 1
+
+
+def test_a_closed_chain_is_followed_around() -> None:
+    mask = np.zeros((30, 30), bool)
+    mask[5, 5:20] = mask[19, 5:20] = True
+    mask[5:20, 5] = mask[5:20, 19] = True
+    crest.thin(mask, np.ones(mask.shape, np.float32))
+    pixels, starts = crest.trace_chains(mask)
+    assert starts.tolist() == [0, int(mask.sum())]
+    assert abs(np.diff(pixels, axis=0)).max() == 1
+
+
+def test_the_crest_of_a_line_is_its_middle() -> None:
+    v, _ = np.mgrid[0:30, 0:40]
+    magnitude = np.exp(-0.5 * ((v - 14.3) / 1.5) ** 2).astype(np.float32)
+    field = np.dstack([magnitude, np.zeros_like(magnitude)])
+    mask = crest.crest_pixels(field, magnitude, 0.1)
+    assert mask[14, 1:39].all()
+    assert mask.sum() == 38

@@ -1,0 +1,164 @@
+"""`reconstruct`: a stereo pair on disk to a curve in JSON, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from services.reconstruct import ReconstructConfig, run
+from suturetrack import nurbs
+from suturetrack.calibration import save_calibration
+from suturetrack.camera import StereoRig
+from suturetrack.metrics import curve_error
+from suturetrack.types import Image, InputError, Nurbs
+from tests.test_initialization import dense, draw
+
+
+@pytest.fixture
+def pair(rig: StereoRig, curve: Nurbs, tmp_path: Path) -> tuple[Image, Image, ReconstructConfig]:
+    """Both images, and the configuration for the files that hold them."""
+    left, right = rig.project(dense(curve))
+    images = draw(left, rig), draw(right, rig)
+    save_calibration(tmp_path / "rig.yaml", rig)
+    u, v = left[700]
+    config = ReconstructConfig(
+        tmp_path / "left.png",
+        tmp_path / "right.png",
+        calibration=tmp_path / "rig.yaml",
+        seed=(float(u), float(v)),
+        output=tmp_path / "thread.json",
+    )
+    write(config, *images)
+    return *images, config
+
+
+def write(config: ReconstructConfig, left: Image, right: Image) -> None:
+    assert config.right is not None
+    cv2.imwrite(str(config.left), left)
+    cv2.imwrite(str(config.right), right)
+
+
+def curve_in(path: Path) -> Nurbs:
+    o = json.loads(path.read_text())
+    return Nurbs(o["degree"], *(np.array(o[k]) for k in ("knots", "control_points", "weights")))
+
+
+def test_a_pair_becomes_one_object(
+    pair: tuple[Image, Image, ReconstructConfig], curve: Nurbs
+) -> None:
+    config = pair[2]
+    run(config)
+    written = json.loads(config.output.read_text())
+    found = curve_in(config.output)
+    assert curve_error(dense(found), dense(curve)).mean < 0.3
+    assert written["length"] == pytest.approx(nurbs.length(found))
+    assert 0 < written["reprojection_px"] < 0.2
+    assert 0.5 < written["confidence"] <= 1
+
+
+def test_side_by_side_is_the_same(pair: tuple[Image, Image, ReconstructConfig]) -> None:
+    left, right, config = pair
+    run(config)
+    both = config.left.with_name("both.png")
+    cv2.imwrite(str(both), np.hstack([left, right]))
+    other = ReconstructConfig(
+        both,
+        calibration=config.calibration,
+        seed=config.seed,
+        output=config.output.with_name("other.json"),
+        layout="side-by-side",
+    )
+    run(other)
+    assert other.output.read_text() == config.output.read_text()
+
+
+def halved(image: Image) -> Image:
+    return cv2.resize(image, None, fx=0.5, fy=0.5)
+
+
+def coloured(image: Image) -> Image:
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+
+
+def washed_out(image: Image) -> Image:
+    return np.where(np.arange(len(image))[:, None] < 20, image, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("change_left", "change_right", "message"),
+    [
+        (None, halved, "differ in size"),
+        (halved, halved, "the calibration is for 640x480"),
+        (coloured, None, "one image is gray"),
+        (lambda i: i.astype(np.uint16) * 257, None, "convert the image to 8 bit"),
+        (lambda i: np.full_like(i, 90), None, "left image is empty"),
+        (None, lambda i: np.full_like(i, 255), "right image is empty"),
+        (washed_out, None, "saturated"),
+        (None, lambda i: i[::-1], "right view"),
+    ],
+)
+def test_bad_images_are_refused(
+    pair: tuple[Image, Image, ReconstructConfig], change_left, change_right, message: str
+) -> None:
+    left, right, config = pair
+    write(
+        config,
+        change_left(left) if change_left else left,
+        change_right(right) if change_right else right,
+    )
+    with pytest.raises(InputError, match=message) as refusal:
+        run(config)
+    assert "\n" not in str(refusal.value)
+    assert not config.output.exists()
+    assert {p.suffix for p in config.output.parent.iterdir()} == {".png", ".yaml"}
+
+
+def test_swapped_views_are_named(pair: tuple[Image, Image, ReconstructConfig]) -> None:
+    left, right, config = pair
+    columns = np.flatnonzero((right < 150).any(0))
+    column = int(columns[len(columns) // 2])
+    row = int(np.argmin(right[:, column]))
+    write(config, right, left)
+    swapped = ReconstructConfig(
+        config.left,
+        config.right,
+        calibration=config.calibration,
+        seed=(float(column), float(row)),
+        output=config.output,
+    )
+    with pytest.raises(InputError, match="swapped"):
+        run(swapped)
+    assert not config.output.exists()
+
+
+def test_a_missing_image_is_named(pair: tuple[Image, Image, ReconstructConfig]) -> None:
+    config = pair[2]
+    config.left.unlink()
+    with pytest.raises(InputError, match=r"no image .*left\.png"):
+        run(config)
+
+
+def test_an_unreadable_image_is_named(pair: tuple[Image, Image, ReconstructConfig]) -> None:
+    config = pair[2]
+    config.left.write_bytes(b"no image at all")
+    with pytest.raises(InputError, match=r"left\.png"):
+        run(config)
+
+
+def test_an_output_that_cannot_be_written_is_named(
+    pair: tuple[Image, Image, ReconstructConfig], tmp_path: Path
+) -> None:
+    config = pair[2]
+    impossible = ReconstructConfig(
+        config.left,
+        config.right,
+        calibration=config.calibration,
+        seed=config.seed,
+        output=tmp_path / "nowhere" / "thread.json",
+    )
+    with pytest.raises(InputError, match="cannot write"):
+        run(impossible)
