@@ -42,6 +42,9 @@ class Transport(Protocol):
     def put(self, key: str, packet: Packet, *, large: bool) -> None:
         """Sends to all subscribers and does not wait for them."""
 
+    def make_room(self, size: int) -> None:
+        """Prepares for large messages of so many bytes, so that the first one is not late."""
+
     def subscribe(self, pattern: str, deliver: Deliver) -> None:
         """Calls `deliver(key, packet)` from another thread for every packet that arrives."""
 
@@ -173,6 +176,10 @@ class Bus:
         self._numbers[key] += 1
         packet = wire.encode(message, self._publisher, number, time.time_ns())
         self._transport.put(key, packet, large=topic.keep == "newest")
+
+    def make_room(self, example: object) -> None:
+        """Prepares for images or fields like this one, so that the first one is not late."""
+        self._transport.make_room(len(wire.encode(example).payload))
 
     def newest(self, topic: Topic[T]) -> Reader[T]:
         """Reads the newest message each time, passing over those that came in between."""

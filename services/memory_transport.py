@@ -45,6 +45,9 @@ class MemoryTransport:
                 if _matches(pattern, key):
                     deliver(key, packet)
 
+    def make_room(self, size: int) -> None:
+        """See `Transport`."""
+
     def subscribe(self, pattern: str, deliver: Deliver) -> None:
         """See `Transport`."""
         self.subscriptions.append((pattern, deliver))

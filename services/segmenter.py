@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from services import topics
 from services.service import Service, ServiceConfig, Stopped
 from services.wire import scaled
+from suturetrack.camera import StereoRig
 from suturetrack.segmentation import SegmentationConfig, Segmenter
-from suturetrack.types import InputError, Seed
+from suturetrack.types import InputError, RidgeField, Seed, Stamp, StereoFrame
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,7 @@ def run(service: Service, config: SegmenterConfig) -> None:
     rig = service.calibrated_rig()
     segmenter = Segmenter(rig, config.segmentation)
     segmenter.warm_up()
+    bus.make_room(_warm_up(rig, config))
     recorder = service.record(rig, config)
     seedings = bus.every(topics.SEEDING)
     seeds = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
@@ -50,3 +53,13 @@ def run(service: Service, config: SegmenterConfig) -> None:
             continue
         bus.publish(topics.FIELD, ridges)
         recorder.field(ridges, service.finished(frame.stamp))
+
+
+def _warm_up(rig: StereoRig, config: SegmenterConfig) -> RidgeField:
+    """Learns from and segments noise, so that the first frame is not late."""
+    width, height = rig.image_size
+    noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    frame = StereoFrame(Stamp(0, 0, 0), noise, noise)
+    segmenter = Segmenter(rig, config.segmentation)
+    segmenter.learn(frame, Seed(pixel=(width / 2, height / 2)))
+    return segmenter.step(frame)

@@ -46,6 +46,9 @@ def run(service: Service, config: SourceConfig) -> None:
     steps = bus.every(topics.STEP)
     bus.answer(topics.CALIBRATION, lambda _: rig)
     recorder = service.record(rig, config)
+    first = footage.read(0)
+    if first is not None:
+        bus.make_room(StereoFrame(Stamp(0, 0, 0), first.left, first.right))
     service.ready()
     if not footage.live and not bus.wait_for_alive("segmenter"):
         return

@@ -153,6 +153,13 @@ class ZenohTransport:
         publisher = self._publisher(key, large=large)
         publisher.put(content, encoding=packet.encoding, attachment=packet.attachment)
 
+    def make_room(self, size: int) -> None:
+        """See `Transport`."""
+        if self._patient or size <= self._pooled_size:
+            return
+        self._pooled_size = size
+        self._pool = _make_pool(size)
+
     def subscribe(self, pattern: str, deliver: Deliver) -> None:
         """See `Transport`."""
 
@@ -225,9 +232,7 @@ class ZenohTransport:
 
     def _share(self, payload: bytes) -> bytes | ZShmMut:
         """The payload in shared memory; itself where there is none, or no room in it."""
-        if len(payload) > self._pooled_size:
-            self._pooled_size = len(payload)
-            self._pool = _make_pool(_POOLED * len(payload))
+        self.make_room(len(payload))
         if self._pool is None:
             return payload
         try:
@@ -251,12 +256,17 @@ class ZenohTransport:
 
 
 def _make_pool(size: int) -> ShmProvider | None:
+    """Shared memory for `_POOLED` messages of a size; None where there is not enough."""
     try:
-        if shutil.disk_usage("/dev/shm").free < 2 * size:
+        if shutil.disk_usage("/dev/shm").free < 2 * _POOLED * size:
             return None
-        return ShmProvider.default_backend(size)
+        pool = ShmProvider.default_backend(_POOLED * size)
+        # Writing to the memory once makes the system provide it now and not with the first frames.
+        for buffer in [pool.alloc(size) for _ in range(_POOLED - 1)]:
+            buffer[:] = bytes(size)
     except (OSError, zenoh.ZError):
         return None
+    return pool
 
 
 class ArrivedPayload:
