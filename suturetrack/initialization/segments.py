@@ -46,7 +46,8 @@ class Ridges:
 
 def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
     """Crest lines of an (H, W, 2) field, split at junctions; weak and tiny ones are left out."""
-    magnitude = cv2.magnitude(field[..., 0], field[..., 1])
+    # cv2.magnitude would make the last bits depend on where the arrays lie in memory.
+    magnitude = np.sqrt(field[..., 0] ** 2 + field[..., 1] ** 2)
     background = float(np.quantile(magnitude[::4, ::4], _NOISE_QUANTILE))
     low = float(np.clip(_ABOVE_NOISE * background, config.low / 4, config.low))
     mask = crest.crest_pixels(field, magnitude, low)
