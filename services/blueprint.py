@@ -11,7 +11,8 @@ from services.drawing.common import VIEWS, part
 from suturetrack.types import Float64
 
 PROCESSES = ("source", "segmenter", "tracker")
-_EYE = np.array([-0.75, -0.6, -0.75])
+_IN_DETAIL = ("tangent", "reliability")
+_EYE = np.array([-0.7, -0.55, -0.75])
 """Where the eye of the view of space is from its target, in distances of the thread."""
 
 
@@ -42,12 +43,12 @@ def blueprint(threads: Sequence[str], target: Float64) -> rrb.Blueprint:
 def _scene(names: Sequence[str], target: Float64) -> rrb.Container:
     images = rrb.Horizontal(*(_view(view, "", "/curve") for view in VIEWS))
     # From the side, with the cameras at one edge and the thread at the other.
-    middle, distance = 0.75 * target, np.linalg.norm(target)
+    middle, distance = 0.7 * target, np.linalg.norm(target)
     eye = rrb.EyeControls3D(
         position=middle + distance * _EYE, look_target=middle, eye_up=(0, -1, 0)
     )
     hidden = [f"- /rig/{view}/**" for view in VIEWS]
-    hidden += [f"- /rig/thread/{name}/tangent" for name in names]
+    hidden += [f"- /rig/thread/{name}/{part}" for name in names for part in _IN_DETAIL]
     shown = [f"+ /rig/{view}/image" for view in VIEWS]
     contents = ["+ /rig/**", *hidden, *shown]
     space = rrb.Spatial3DView(origin="/rig", name="Space", contents=contents, eye_controls=eye)
@@ -71,7 +72,7 @@ def _plots(names: Sequence[str]) -> rrb.Container:
 
 
 def _curve(names: Sequence[str]) -> rrb.Container:
-    parts = ("tangent", "reliability", "control_points")
+    parts = (*_IN_DETAIL, "control_points")
     contents = [f"/rig/thread/{name}/{part}" for name in names for part in parts]
     return rrb.Horizontal(
         rrb.Spatial3DView(origin="/rig", name="Tangents and reliability", contents=contents),
