@@ -49,6 +49,7 @@ def respace(
     close = [int(i) for i in np.flatnonzero(gaps[1:-2] + gaps[2:-1] < 2 * spacing_px[0])]
     close = [i for n, i in enumerate(close) if n == 0 or close[n - 1] < i - 1]
     near = [curve.knots[i + 4] for i in close if i + 4 < len(curve.knots) - 4]
+    near += _crowded_ends(curve.knots, gaps, spacing_px[0])
     wide = _midpoints(curve.knots, np.flatnonzero(gaps > spacing_px[1]))
     for s in wide:
         curve = insert_knot(curve, s)
@@ -56,6 +57,20 @@ def respace(
         interior = np.unique(curve.knots)[1:-1]
         curve = refit(curve, interior[~np.isin(interior, near)])
     return curve, len(wide), len(near)
+
+
+def _crowded_ends(knots: Float64, gaps: Float64, least_px: float) -> list[float]:
+    """Knots beside an end that its forces have pushed onto its neighbour.
+
+    The end moves alone (Section VI-D). Were it to pass its neighbour, the tangent there would turn
+    round, and the end would run back along the thread. Clamped knots make the last gap a third of
+    the others.
+    """
+    return [
+        float(knots[knot])
+        for knot, gap in ((4, gaps[0]), (-5, gaps[-1]))
+        if gap < least_px / 4 and 0 < knots[knot] < 1
+    ]
 
 
 def _midpoints(knots: Float64, gaps: Int64) -> list[float]:

@@ -30,6 +30,7 @@ _REFINED_PX = 3.0
 # A shorter run of samples that look like thread is chance.
 _SHORTEST_RUN_PX = 10.0
 _OUTLIER_PX = 1.0
+_HIDDEN_DRIFT_PX = 3.0
 _EVEN = 150.0
 
 
@@ -133,13 +134,15 @@ class _Reference:
 
     points: Float64
     """(k, 3) predicted samples."""
+    second: Float64
+    """(k, 3) predicted second derivatives."""
     speed: float
     """Length of the curve: |df/ds| everywhere."""
 
     @classmethod
     def of(cls, samples: Samples, curve: Nurbs) -> _Reference:
-        local = _norm(samples.values(curve.control_points, 1))
-        return cls(samples.values(curve.control_points), float(np.sum(samples.share * local)))
+        points, first, second = (samples.values(curve.control_points, d) for d in range(3))
+        return cls(points, second, float(np.sum(samples.share * _norm(first))))
 
 
 class _Linearized:
@@ -189,38 +192,46 @@ class _Linearized:
     def _add_prediction(
         self, equations: _Equations, reference: _Reference, config: TrackingConfig
     ) -> None:
-        """The drift is one of pixels, so that the past holds depth no tighter than the images do."""
+        """The drift is one of pixels, so that the past holds depth no tighter than the images do.
+
+        Where the thread is hidden, the past is all there is, and holds it in depth as well.
+        """
         weight = self._amount(self.views[0]) / config.drift_px**2 / 2
+        information = sum(
+            weight[:, None, None] * (view.jacobian.transpose(0, 2, 1) @ view.jacobian)
+            for view in self.views
+        )
+        held = self._hidden * self._amount(self.views[0]) / (_HIDDEN_DRIFT_PX * self._pixel) ** 2
+        information = information + held[:, None, None] * np.eye(3)
         away = (reference.points - self.points)[:, :, None]
-        for view in self.views:
-            information = weight[:, None, None] * (view.jacobian.transpose(0, 2, 1) @ view.jacobian)
-            equations.add(self.samples, 0, information, (information @ away)[:, :, 0])
+        equations.add(self.samples, 0, information, (information @ away)[:, :, 0])
 
     def _add_shape(
         self, equations: _Equations, reference: _Reference, config: TrackingConfig
     ) -> None:
         """Little bending, and an even speed along the curve: f'' across and along the tangent.
 
-        No length is asked for: noise in depth only ever adds to the length, and a goal taken from
-        the curve itself would keep what it adds.
-        """
-        """Little bending, and an even speed along the curve: f'' across and along the tangent.
-
-        No length is asked for: noise in depth only ever adds to the length, and a goal taken from
-        the curve itself would keep what it adds.
+        Where the thread is hidden it keeps the bends that it had. No length is asked for: noise in
+        depth only ever adds to the length, and a goal taken from the curve would keep what it adds.
         """
         speed = reference.speed
         tangent = self.first / _norm(self.first)[:, None]
         along = tangent[:, :, None] * tangent[:, None, :]
         bending = config.smoothing * self._pixel * self.samples.share / speed**3
         stretch = self._amount(self.views[0]) / (config.stretch * speed) ** 2 / _EVEN**2
+        goal = np.where(self._hidden[:, None], reference.second, 0.0) - self.second
         information = bending[:, None, None] * np.eye(3) + stretch[:, None, None] * along
-        pull = -(information @ self.second[:, :, None])[:, :, 0]
+        pull = (information @ goal[:, :, None])[:, :, 0]
         equations.add(self.samples, 2, information, pull)
 
     def _amount(self, view: View) -> Float64:
         """(k,) how many independent measurements each sample stands for."""
         return view.speed * self.samples.share / _CORRELATION_PX
+
+    @property
+    def _hidden(self) -> Bool:
+        """(k,) samples that neither image shows."""
+        return ~(self.offsets[0].found | self.offsets[1].found)
 
     @property
     def _pixel(self) -> Float64:

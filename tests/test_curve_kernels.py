@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from suturetrack import nurbs
+from suturetrack.kernels import search, spline
+from tests.reference import curve_fit as reference
+
+RNG = np.random.default_rng(3)
+KNOTS = nurbs.clamped_knots(np.array([0.07, 0.2, 0.45, 0.5, 0.81]), 3)
+S = np.sort(np.r_[0.0, RNG.uniform(0, 1, 40), 1.0])
+
+
+def test_the_local_basis_is_that_of_scipy() -> None:
+    first, table = spline.local_basis(S, KNOTS)
+    for times in range(3):
+        dense = np.zeros((len(S), len(KNOTS) - 4))
+        np.put_along_axis(dense, first[:, None] + np.arange(4), table[times], 1)
+        np.testing.assert_allclose(dense, reference.design(S, KNOTS, times), atol=1e-8)
+
+
+def test_points_and_their_transpose_agree_with_dense_matrices() -> None:
+    first, table = spline.local_basis(S, KNOTS)
+    a = reference.design(S, KNOTS)
+    control, points = RNG.normal(size=(9, 3)), RNG.normal(size=(len(S), 2))
+    np.testing.assert_allclose(spline.combine(first, table[0], control), a @ control, atol=1e-12)
+    np.testing.assert_allclose(spline.gather(first, table[0], points), a.T @ points, atol=1e-12)
+
+
+def test_banded_least_squares_is_dense_least_squares() -> None:
+    first, table = spline.local_basis(S, KNOTS)
+    rows = RNG.normal(size=(len(S), 3, 3))
+    information = rows @ rows.transpose(0, 2, 1)
+    pull = RNG.normal(size=(len(S), 3))
+    band, right = np.zeros((27, spline.BANDWIDTH)), np.zeros(27)
+    spline.add_rows(first, table[0], information, pull, band, right)
+    matrix, dense_right = reference.normal_equations(reference.design(S, KNOTS), information, pull)
+    inverse = np.linalg.inv(matrix)
+    assert spline.factorize(band)
+    np.testing.assert_allclose(
+        spline.solve_factorized(band, right), inverse @ dense_right, rtol=1e-6
+    )
+    covariance = spline.sample_covariance(first, table[0], spline.band_of_inverse(band))
+    for j, row in enumerate(reference.design(S, KNOTS)):
+        spread = np.kron(row[:, None], np.eye(3))
+        np.testing.assert_allclose(
+            covariance[j], spread.T @ inverse @ spread, rtol=1e-6, atol=1e-12
+        )
+
+
+def test_a_band_that_is_not_positive_definite_is_told() -> None:
+    band = np.zeros((6, spline.BANDWIDTH))
+    band[:, 0] = [1, 1, -1, 1, 1, 1]
+    assert not spline.factorize(band)
+
+
+@given(st.floats(-1, 12), st.floats(-1, 9), st.floats(0, 2 * np.pi))
+def test_responses_are_bilinear_and_blind_to_the_sign_of_the_field(
+    u: float, v: float, angle: float
+) -> None:
+    field = np.random.default_rng(5).normal(size=(8, 11, 2)).astype(np.float32)
+    flipped = field * np.random.default_rng(6).choice([-1, 1], (8, 11, 1)).astype(np.float32)
+    tangent = np.array([np.cos(angle), np.sin(angle)])
+    expected = reference.response(field, u, v, tangent)
+    for f in (field, flipped):
+        assert search.response_at(f, u, v, *tangent) == pytest.approx(expected, abs=1e-5)
+
+
+@given(
+    hnp.arrays(np.float64, (4, 5), elements=st.floats(0, 1)), st.floats(0, 0.5), st.integers(1, 4)
+)
+def test_the_best_path_is_the_best_of_all(gain: np.ndarray, stiffness: float, reach: int) -> None:
+    path = search.best_path(gain, stiffness, reach)
+    steps = np.diff(path)
+    worth = gain[np.arange(4), path].sum() - stiffness * (steps**2).sum()
+    assert np.all(np.abs(steps) <= reach)
+    assert worth == pytest.approx(reference.best_path(gain, stiffness, reach))
+
+
+@given(st.floats(-2, 2), st.floats(1.2, 2.5))
+def test_peaks_are_found_below_the_sample(centre: float, sigma: float) -> None:
+    grid = 0.5 * np.arange(-10, 11)
+    profile = np.exp(-0.5 * ((grid - centre) / sigma) ** 2)[None, :]
+    position, height = search.peaks(profile, np.array([10]), 3)
+    assert 0.5 * (position[0] - 10) == pytest.approx(centre, abs=0.05)
+    assert height[0] > 0.95
+
+
+def test_no_peak_at_the_rim_or_on_nothing() -> None:
+    rising, empty = np.linspace(0, 1, 21), np.zeros(21)
+    position, _ = search.peaks(np.stack([rising, empty]), np.array([10, 10]), 3)
+    assert np.isnan(position).all()
+
+
+def test_short_runs_are_dropped() -> None:
+    flags = np.array([1, 1, 0, 1, 1, 1, 0, 1], bool)
+    kept = search.solid(flags, np.full(8, 2.0), 5.0)
+    np.testing.assert_array_equal(kept, [0, 0, 0, 1, 1, 1, 0, 0])

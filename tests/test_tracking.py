@@ -1,0 +1,257 @@
+"""The tracker on painted fields of threads that move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from suturetrack import metrics, nurbs
+from suturetrack.camera import StereoRig
+from suturetrack.tracking import Tracker, TrackingConfig
+from suturetrack.tracking.control_points import rearrange, refit
+from suturetrack.types import RidgeField, Seed, Status, ThreadState
+from tests.conftest import make_rig
+from tests.painting import FPS, paint, stamp, thread
+
+
+def seed_on(rig: StereoRig, points: np.ndarray, name: str = "0") -> Seed:
+    u, v = rig.project_raw(points[len(points) // 2])[0]
+    return Seed(name, pixel=(float(u), float(v)))
+
+
+def error(state: ThreadState, truth: np.ndarray) -> metrics.CurveError:
+    assert state.curve is not None
+    return metrics.curve_error(nurbs.evaluate(state.curve, np.linspace(0, 1, 500)), truth)
+
+
+def follow(
+    fields: Sequence[RidgeField], rig: StereoRig, seed: Seed, **config: object
+) -> list[ThreadState]:
+    tracker = Tracker(rig, TrackingConfig(**config))  # type: ignore[arg-type]
+    tracker.seed(seed)
+    return [tracker.step(field).states[0] for field in fields]
+
+
+@pytest.mark.parametrize(
+    ("method", "rms", "end"), [("gauss-newton", 0.1, 0.6), ("paper", 0.4, 1.5)]
+)
+def test_a_moving_thread_is_followed(
+    rig: StereoRig, method: Literal["gauss-newton", "paper"], rms: float, end: float
+) -> None:
+    truths = [thread(i / FPS) for i in range(45)]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    states = follow(fields, rig, seed_on(rig, truths[0]), method=method)
+    for state, truth in list(zip(states, truths, strict=True))[3:]:
+        assert state.status is Status.TRACKING
+        found = error(state, truth)
+        assert found.rms < rms
+        assert max(found.ends) < end
+        assert abs(found.length_percent) < 1.0
+        assert state.seen.mean() > 0.95
+        assert -1 <= state.energies.image_left < -0.5
+        assert 0 <= state.energies.end < 0.3
+        assert state.energies.internal > 0
+
+
+def test_the_unit_of_the_calibration_does_not_matter() -> None:
+    in_mm, in_m = make_rig(40.0, 1e-3), make_rig(0.04, 1.0)
+    curves = []
+    for rig, scale in ((in_mm, 1.0), (in_m, 1e-3)):
+        truths = [thread(i / FPS) * scale for i in range(6)]
+        fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+        state = follow(fields, rig, seed_on(rig, truths[0]))[-1]
+        assert state.curve is not None
+        curves.append(state.curve.control_points / scale)
+    np.testing.assert_allclose(curves[0], curves[1], atol=1e-3)
+
+
+def test_a_thread_that_vanishes_is_lost_in_time_and_found_again(rig: StereoRig) -> None:
+    truths = [thread(i / FPS) for i in range(36)]
+    fields = [
+        paint(rig, [points] if i < 8 or i >= 24 else [], i) for i, points in enumerate(truths)
+    ]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    assert all(s.status is Status.TRACKING for s in states[:8])
+    assert all(s.status is not Status.TRACKING for s in states[8:24])
+    assert states[8 + round(0.3 * FPS)].status is Status.LOST
+    assert any("lost" in s.events for s in states[8:24])
+    back = states[24 + round(0.3 * FPS) :]
+    assert all(s.status is Status.TRACKING for s in back)
+    assert error(back[-1], truths[-1]).rms < 0.1
+    start = nurbs.evaluate(back[-1].curve, np.array([0.0]))[0]  # type: ignore[arg-type]
+    before = nurbs.evaluate(states[7].curve, np.array([0.0, 1.0]))  # type: ignore[arg-type]
+    assert np.linalg.norm(start - before[0]) < np.linalg.norm(start - before[1])
+
+
+def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:
+    truths = [thread(i / FPS) for i in range(30)]
+    fields = []
+    for i, points in enumerate(truths):
+        u, v = rig.project(points[300])[0]
+        fields.append(paint(rig, [points], i, [(u, v, 22.0)] if i >= 8 else []))
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    for state, truth in list(zip(states, truths, strict=True))[10:]:
+        assert state.status is Status.TRACKING
+        assert not state.seen[30:34].any()
+        assert state.seen[:20].all()
+        assert state.seen[44:].all()
+        assert state.sigma[32] > 1.5 * state.sigma[16]
+        found = error(state, truth)
+        assert found.rms < 0.5
+        assert found.largest < 2.0
+        assert abs(found.length_percent) < 1.0
+
+
+def test_a_hidden_end_is_held_and_taken_up_again(rig: StereoRig) -> None:
+    truths = [thread(i / FPS) for i in range(36)]
+    fields = []
+    for i, points in enumerate(truths):
+        u, v = rig.project(points[-1])[0]
+        fields.append(paint(rig, [points], i, [(u, v, 40.0)] if 10 <= i < 26 else []))
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    for state in states[10:26]:
+        assert state.length == pytest.approx(100.0, rel=0.02)
+        assert not state.seen[-3:].any()
+    assert max(error(states[-1], truths[-1]).ends) < 0.6
+
+
+def test_a_thread_that_is_drawn_out_grows(rig: StereoRig) -> None:
+    whole = thread(0.0)
+    lengths = np.linspace(350, 560, 40).astype(int)
+    fields = [paint(rig, [whole[:k]], i) for i, k in enumerate(lengths)]
+    states = follow(fields, rig, seed_on(rig, whole[:350]))
+    for state, k in list(zip(states, lengths, strict=True))[3:]:
+        assert state.length == pytest.approx(metrics.polyline_length(whole[:k]), rel=0.012)
+        assert state.status is Status.TRACKING
+    assert len(states[-1].curve.control_points) > len(states[0].curve.control_points)  # type: ignore[union-attr]
+
+
+def test_an_end_does_not_run_on_along_what_it_meets(rig: StereoRig) -> None:
+    truth = thread(0.0)
+    along = truth[-1] - truth[-2]
+    beyond = truth[-1] + np.linspace(0.0, 90.0, 60)[:, None] * along / np.linalg.norm(along)
+    fields = [
+        paint(rig, [truth] if i < 15 else [truth, beyond], i, strength=0.8) for i in range(30)
+    ]
+    states = follow(fields, rig, seed_on(rig, truth))
+    assert states[-1].length == pytest.approx(100.0, rel=0.02)
+
+
+def test_an_end_that_leaves_the_image_is_cut_at_the_border(rig: StereoRig) -> None:
+    truths = [thread(0.3) + np.array([60.0 * i / 30, 0.0, 0.0]) for i in range(30)]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    u = rig.project(truths[-1])[0][:, 0]
+    assert u.max() > 645
+    assert states[-1].status is Status.TRACKING
+    curve = states[-1].curve
+    assert curve is not None
+    found = nurbs.evaluate(curve, np.linspace(0, 1, 300))
+    assert rig.project(found)[0][:, 0].max() < 642
+    visible = truths[-1][u < 636]
+    assert metrics.coverage(found, visible, 0.5) > 0.98
+
+
+def test_two_threads_keep_their_names(rig: StereoRig) -> None:
+    pairs = [
+        (thread(i / FPS) - [0, 8, 0], thread(1 + i / FPS, 80.0, 210.0, -0.6) + np.array([0, 14, 0]))
+        for i in range(20)
+    ]
+    tracker = Tracker(rig)
+    for name, points in zip("ab", pairs[0], strict=True):
+        tracker.seed(seed_on(rig, points, name))
+    for i, pair in enumerate(pairs):
+        step = tracker.step(paint(rig, pair, i))
+    assert [state.thread for state in step.states] == ["a", "b"]
+    for state, truth in zip(step.states, pairs[-1], strict=True):
+        assert error(state, truth).rms < 0.15
+    tracker.forget("a")
+    assert [s.thread for s in tracker.step(paint(rig, pair, 20)).states] == ["b"]
+
+
+def test_fields_that_repeat_or_come_late_change_nothing(rig: StereoRig) -> None:
+    truths = [thread(i / FPS) for i in range(12)]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, truths[0]))
+    for field in fields[:10]:
+        last = tracker.step(field).states[0]
+    for late in (fields[9], fields[4]):
+        again = tracker.step(late).states[0]
+        assert again.curve is last.curve
+        assert again.status is last.status
+        assert again.stamp == late.stamp
+    assert error(tracker.step(fields[10]).states[0], truths[10]).rms < 0.1
+
+
+def test_dropped_fields_and_a_jump_in_time_are_survived(rig: StereoRig) -> None:
+    frames = [*range(6), 9, 13, 14, 15]
+    fields = [paint(rig, [thread(i / FPS)], i) for i in frames]
+    fields += [replace(paint(rig, [thread(15 / FPS)], 16), stamp=stamp(900))]
+    states = follow(fields, rig, seed_on(rig, thread(0.0)))
+    assert all(state.status is Status.TRACKING for state in states)
+    assert error(states[-1], thread(15 / FPS)).rms < 0.1
+
+
+def test_the_thread_is_looked_for_until_patience_ends(rig: StereoRig) -> None:
+    truth = thread(0.0)
+    fields = [paint(rig, [] if i < 5 else [truth], i) for i in range(8)]
+    states = follow(fields, rig, seed_on(rig, truth))
+    for state in states[:5]:
+        assert state.status is Status.LOST
+        assert state.curve is None
+        assert np.isnan(state.length)
+        assert state.events[0].startswith("not found")
+    assert "found" in states[5].events
+    assert states[7].status is Status.TRACKING
+    given_up = follow(fields, rig, seed_on(rig, truth), patience=3)
+    assert given_up[-1].curve is None
+
+
+def test_knots_go_where_the_bends_are_and_the_shape_stays(rig: StereoRig) -> None:
+    x = np.linspace(-40, 40, 800)
+    points = np.stack([x, 12 * np.exp(-((x / 4) ** 2)), 200 + 0 * x], axis=1)
+    s = np.linspace(0, 1, 800)
+    even = nurbs.fit(points, s, nurbs.clamped_knots(np.linspace(0, 1, 61)[1:-1], 3), 3)
+    placed, _, removed = rearrange(even, rig)
+    assert removed > 0
+    for _ in range(10):
+        placed, inserted, removed = rearrange(placed, rig)
+        if not inserted and not removed:
+            break
+    apart = metrics.polyline_distances(nurbs.evaluate(placed, s), points)
+    assert apart.max() * 4 < 0.5
+    knots = np.unique(placed.knots)
+    assert np.diff(knots).min() < 0.5 * np.diff(knots).max()
+    assert abs(knots[np.argmin(np.diff(knots))] - 0.5) < 0.15
+
+
+def test_more_knots_leave_the_curve_as_it_is(rig: StereoRig) -> None:
+    points = thread(0.0)
+    interior = np.linspace(0, 1, 6)[1:-1]
+    curve = nurbs.fit(points, np.linspace(0, 1, 601), nurbs.clamped_knots(interior, 3), 3)
+    finer = refit(curve, np.sort(np.r_[interior, 0.33, 0.77]))
+    s = np.linspace(0, 1, 100)
+    np.testing.assert_allclose(nurbs.evaluate(finer, s), nurbs.evaluate(curve, s), atol=1e-6)
+    more, inserted, removed = rearrange(curve, rig)
+    assert inserted > 0
+    assert removed == 0
+    np.testing.assert_allclose(nurbs.evaluate(more, s), nurbs.evaluate(curve, s), atol=1e-9)
+
+
+def test_ends_move_along_the_curve_itself() -> None:
+    rng = np.random.default_rng(0)
+    for count in (4, 5, 6, 12):
+        knots = nurbs.clamped_knots(np.sort(rng.uniform(0.1, 0.9, count - 4)), 3)
+        curve = nurbs.curve_from(3, knots, rng.normal(size=(count, 3)))
+        longer = nurbs.with_ends(curve, -0.03, 1.05)
+        back = nurbs.with_ends(longer, 0.03 / 1.08, 1.03 / 1.08)
+        np.testing.assert_allclose(back.control_points, curve.control_points, atol=1e-9)
+        s = np.linspace(0, 1, 20)
+        np.testing.assert_allclose(
+            nurbs.evaluate(longer, (s + 0.03) / 1.08), nurbs.evaluate(curve, s), atol=1e-9
+        )
