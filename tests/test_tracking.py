@@ -96,10 +96,10 @@ def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:
     states = follow(fields, rig, seed_on(rig, truths[0]))
     for state, truth in list(zip(states, truths, strict=True))[10:]:
         assert state.status is Status.TRACKING
-        assert not state.seen[30:34].any()
+        assert not state.seen[32:35].any()
         assert state.seen[:20].all()
         assert state.seen[44:].all()
-        assert state.sigma[32] > 1.5 * state.sigma[16]
+        assert state.sigma[33] > 1.5 * state.sigma[16]
         found = error(state, truth)
         assert found.rms < 0.5
         assert found.largest < 2.0
