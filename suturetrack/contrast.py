@@ -75,7 +75,8 @@ def contrast_at(image: Image, pixel: tuple[float, float]) -> Contrast | None:
     if not found:
         return None
     # The response is strongest where sigma is half the width; the middle is seen best below that.
-    _, sigma, ridge = max(found, key=lambda f: f[0])
+    # Of scales that respond alike the smaller one keeps neighbours apart.
+    _, sigma, ridge = max(found, key=lambda f: f[0] * f[1] ** -0.4)
     return _contrast(_Scene.of(crop, max(SIGMAS[0], 0.6 * sigma)), ridge)
 
 
