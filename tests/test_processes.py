@@ -67,13 +67,20 @@ def children(process: subprocess.Popen[str]) -> dict[str, psutil.Process]:
     return {child.cmdline()[3]: child for child in psutil.Process(process.pid).children()}
 
 
-def wait_for_state(rig: str = ServiceConfig.rig) -> ThreadState:
-    """The first state of a rig that a consumer sees."""
+def wait_for_state(*processes: subprocess.Popen[str], rig: str = ServiceConfig.rig) -> ThreadState:
+    """The first state of a rig that a consumer sees, while the processes live."""
     bus = Bus(ZenohTransport(local_config(rig, "viewer")), rig, "viewer")
-    state = bus.every(topics.STATE).get(60)
-    bus.close()
-    assert state is not None
-    return state
+    states = bus.every(topics.STATE)
+    try:
+        for _ in range(120):
+            state = states.get(0.5)
+            if state is not None:
+                return state
+            for process in processes:
+                assert process.poll() is None, process.communicate()[1]
+    finally:
+        bus.close()
+    raise AssertionError("no state came")
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +151,7 @@ def test_signals_end_each_process_cleanly_and_soon(
         start("segmenter", *options, "--seed", *seed),
         start("source", *STAGE, *options),
     ]
-    wait_for_state("test")
+    wait_for_state(*processes, rig="test")
     for process, number in zip(
         processes, (signal.SIGTERM, signal.SIGINT, signal.SIGTERM), strict=True
     ):
@@ -162,7 +169,7 @@ def test_a_process_that_is_killed_ends_the_run_with_a_clear_line(
     start: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
     run = start("run", *STAGE, "--run-dir", tmp_path)
-    wait_for_state()
+    wait_for_state(run)
     family = children(run)
     assert set(family) == {"source", "segmenter", "tracker"}
     family["segmenter"].send_signal(signal.SIGKILL)
@@ -180,7 +187,7 @@ def test_ctrl_c_ends_a_run_with_its_table(
     start: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
     run = start("run", *STAGE, "--run-dir", tmp_path)
-    wait_for_state()
+    wait_for_state(run)
     family = children(run)
     run.send_signal(signal.SIGINT)
     out, err = run.communicate(timeout=20)
@@ -194,7 +201,7 @@ def test_processes_end_when_their_launcher_is_killed(
     start: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
     run = start("run", *STAGE, "--run-dir", tmp_path)
-    wait_for_state()
+    wait_for_state(run)
     family = children(run)
     run.kill()
     _, alive = psutil.wait_procs(list(family.values()), timeout=10)
