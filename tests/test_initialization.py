@@ -152,6 +152,26 @@ def test_a_crossing_is_passed_straight_on(rig: StereoRig) -> None:
     assert abs(spearmanr(straight, np.arange(len(straight))).statistic) > 0.99
 
 
+def loop_with_a_shared_run() -> Float64:
+    """A thread that winds once and a quarter around a circle, the second time behind the first."""
+    t = np.linspace(-0.35 * np.pi, 2.05 * np.pi, 2500)
+    around = np.c_[14 * np.sin(t), 14 * np.cos(t), 195 + 6 * t / t[-1]]
+    before, after = around[1] - around[0], around[-1] - around[-2]
+    lead = np.linspace(1500, 1, 800)[:, None]
+    return np.r_[around[0] - lead * before, around, around[-1] + lead[::-1] * after]
+
+
+def test_strands_that_lie_on_each_other_are_both_followed(rig: StereoRig) -> None:
+    truth = loop_with_a_shared_run()
+    left, right = rig.project(truth)
+    field = field_of(draw(left, rig), draw(right, rig), rig)
+    found = initialize(field, rig, Seed(pixel=tuple(left[300])))
+    error = curve_error(dense(found.curve, 3000), truth)
+    assert abs(error.length_percent) < 5
+    assert max(error.ends) < 2
+    assert error.rms < 1.5
+
+
 def test_a_highlight_is_bridged(rig: StereoRig, curve: Nurbs) -> None:
     truth = dense(curve)
     views = []

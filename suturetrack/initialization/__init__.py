@@ -9,7 +9,7 @@ from suturetrack.initialization.confidence import judge
 from suturetrack.initialization.ends import move_end, read_end
 from suturetrack.initialization.fitting import fit_marks, image_parameters, refine
 from suturetrack.initialization.growth import Chain, grow_thread, nearest_segment
-from suturetrack.initialization.matching import match
+from suturetrack.initialization.matching import Match, match
 from suturetrack.initialization.model import (
     Growth,
     Initialization,
@@ -53,17 +53,19 @@ def initialize(
     if origin is None:
         raise InitializationError(_nothing_there(candidates, pixel, config), candidates)
     chain, left = grow_thread(ridges[0], origin, pixel, config)
-    matched = match(chain, field.left, field.right, rig)
-    right_chain, right = _right_growth(ridges[1], matched.right, config)
+    nearest = float(rig.left.projection[0, 2] - rig.right.projection[0, 2])
+    matched = match(chain, field.left, field.right, nearest, 1)
+    right_chain, right = _right_growth(ridges[1], matched.pixels, config)
+    pixels = np.c_[chain.pixels, matched.pixels]
     step = max(1, round(config.step_px))
-    marks = np.stack([chain.pixels[::step], matched.right[::step]], axis=1)
-    growth = Growth(left, right, marks)
+    growth = Growth(left, right, pixels[::step].reshape(-1, 2, 2))
     if len(chain.pixels) < _SHORTEST_STEPS * step:
         reason = f"the ridge at the seed is only {len(chain.pixels)} px long"
         raise InitializationError(reason, candidates, growth)
     if np.median(matched.response) < _LEAST_MATCH:
-        raise InitializationError(_no_match(chain, field, rig), candidates, growth)
-    pixels = _trim(np.c_[chain.pixels, matched.right], field)
+        swapped = match(chain, field.left, field.right, nearest, -1)
+        raise InitializationError(_no_match(swapped), candidates, growth)
+    pixels = _trim(pixels, field)
     s = image_parameters(pixels[:, :2], pixels[:, 2:])
     points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
     curve = fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
@@ -115,9 +117,8 @@ def _right_growth(
     return grow_thread(ridges, origin, middle, config)
 
 
-def _no_match(chain: Chain, field: RidgeField, rig: StereoRig) -> str:
+def _no_match(swapped: Match) -> str:
     reason = "the right view shows no thread along the epipolar lines of the left one"
-    swapped = match(chain, field.left, field.right, rig, swapped=True)
     if np.median(swapped.response) >= _LEAST_MATCH:
         reason += ", but it does on the other side: left and right are swapped"
     return reason

@@ -11,6 +11,8 @@ from suturetrack.initialization.growth import Chain
 from suturetrack.metrics import coverage
 from suturetrack.types import Float64, Nurbs
 
+_AGREED = 0.95
+"""Share of the thread from which both views are said to agree."""
 _NEAR_PX = 3.0
 _SEEN = 0.1
 """Response from which a crest counts as seen."""
@@ -30,10 +32,8 @@ def judge(
     """
     reasons = []
     pixels = rig.project(nurbs.evaluate(curve, np.linspace(0, 1, 8 * len(curve.control_points))))
-    agreement = min(
-        _agreement(p, chain.pixels, rig) for p, chain in zip(pixels, chains, strict=True)
-    )
-    if agreement < 0.95:
+    agreement = min(_agreement(p, c.pixels, rig) for p, c in zip(pixels, chains, strict=True))
+    if agreement < _AGREED:
         reasons.append(f"left and right view agree about {agreement:.0%} of the thread only")
     seen = float(np.mean([(c.response > _SEEN).mean() for c in samples.crests]))
     if seen < 0.95:
@@ -42,9 +42,10 @@ def judge(
     lowest = 1.0
     for name, chain in zip(("left", "right"), chains, strict=True):
         doubts = _distinct(chain)
-        lowest = min(lowest, float(np.prod([rest for *_, rest in doubts])))
+        lowest = min(lowest, _clarity(chain))
         reasons += [f"{why} in the {name} view at ({u:.0f}, {v:.0f})" for (u, v), why, _ in doubts]
-    confidence *= lowest
+    # Two views that come to the same by themselves are not both mistaken easily.
+    confidence *= np.sqrt(lowest) if agreement >= _AGREED else lowest
     for end in (0, 1):
         readings = [samples.ends[view][end] for view in (0, 1)]
         if any(r.at_border for r in readings):
@@ -56,6 +57,11 @@ def judge(
 
 
 _ORDINAL = ("first", "last")
+
+
+def _clarity(chain: Chain) -> float:
+    """What the doubts about a chain leave of the confidence in it."""
+    return float(np.prod([rest for *_, rest in _distinct(chain)]))
 
 
 def _distinct(chain: Chain) -> list[tuple[Float64, str, float]]:

@@ -50,6 +50,7 @@ def grow_thread(
 ) -> tuple[Chain, ViewGrowth]:
     """Grows by eq. (3) from the seed on segment `origin` and follows the merged segments."""
     merged = merge_ends(ridges, config)
+    ridges = replace(ridges, segments=merged.segments)
     entries = follow(origin, merged.partner)
     entries = _without_faint_ends(ridges, entries, origin)
     on_thread = [e // 2 for e in entries]

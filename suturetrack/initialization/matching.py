@@ -1,4 +1,4 @@
-"""The corresponding points in the right view: disparities by continuity along the thread."""
+"""The corresponding points in the other view: disparities by continuity along the thread."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from suturetrack.camera import StereoRig
 from suturetrack.initialization.growth import Chain
 from suturetrack.kernels import matching as kernel
 from suturetrack.kernels import search
@@ -24,40 +23,35 @@ _LEAST_LEVEL = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """A chain with its counterpart in the right view."""
+    """The counterpart of a chain in the other view."""
 
-    right: Float64
+    pixels: Float64
     """(k, 2) pixels."""
     response: Float64
-    """(k,) how much the right view looks like thread there: 1 as much as the left one."""
+    """(k,) how much the other view looks like thread there: 1 as much as the chain's own."""
 
 
-def match(
-    chain: Chain, left: Float32, right: Float32, rig: StereoRig, swapped: bool = False
-) -> Match:
-    """Finds the thread of the left chain in the right view along the epipolar lines.
+def match(chain: Chain, own: Float32, other: Float32, nearest: float, side: int) -> Match:
+    """Finds the thread of a chain in the other view along the epipolar lines.
 
     Args:
-        chain: the thread in the left view.
-        left: (H, W, 2) left field.
-        right: (H, W, 2) right field.
-        rig: the cameras.
-        swapped: look where the thread would be if the views had been taken for each other.
+        chain: the thread in one view.
+        own: (H, W, 2) field of that view.
+        other: (H, W, 2) field of the other view.
+        nearest: disparity u_own - u_other of points at infinity, px.
+        side: 1 where the other view's pixels lie left of that, as the right camera's do; else -1.
     """
-    offset = rig.left.projection[0, 2] - rig.right.projection[0, 2]
-    first = offset
-    count = int((right.shape[1] - first) / _STATE_PX)
-    if swapped:
-        first = offset - _STATE_PX * count
+    count = int(other.shape[1] / _STATE_PX)
+    first = nearest if side > 0 else nearest - _STATE_PX * (count - 1)
     tangents = chain_tangents(chain.pixels)
-    level = float(np.median(search.responses(left, chain.pixels, tangents)))
+    level = float(np.median(search.responses(own, chain.pixels, tangents)))
     costs = kernel.matching_costs(
-        right, chain.pixels, tangents, first, _STATE_PX, count, max(level, _LEAST_LEVEL)
+        other, chain.pixels, tangents, first, _STATE_PX, count, max(level, _LEAST_LEVEL)
     )
     states, _ = kernel.cheapest_path(costs, _LARGEST_CHANGE, _PENALTY)
     disparity = first + _STATE_PX * states
     pixels = chain.pixels - np.c_[disparity, np.zeros(len(disparity))]
-    inside = (pixels[:, 0] >= 0) & (pixels[:, 0] <= right.shape[1] - 1)
+    inside = (pixels[:, 0] >= 0) & (pixels[:, 0] <= other.shape[1] - 1)
     response = 1.0 - costs[np.arange(len(states)), states].astype(float)
     return Match(pixels, np.where(inside, response, 0.0))
 

@@ -44,6 +44,8 @@ class Merge:
 class Merged:
     """Which ends were joined, and what that cost."""
 
+    segments: tuple[Float64, ...]
+    """Those of the ridges, and once more those that two strands share."""
     partner: dict[int, int]
     """The end that each joined end was joined to."""
     price: dict[tuple[int, int], float]
@@ -64,17 +66,25 @@ class Merged:
             if price >= 2 * _FREE_END:
                 found.append((entry, "a sharp bend", 0.6))
             elif lead < _LEAD:
-                found.append((entry, "an ambiguous crossing", 0.9 if lead > 0 else 0.7))
+                found.append((entry, "an ambiguous crossing", 0.7 + max(lead, -0.2)))
         for tip in (entries[0], entries[-1] ^ 1):
-            if min((p for p, _ in best.get(tip, [])), default=2.0) < _FREE_END:
-                found.append((tip, "an end beside other ridges", 0.5))
+            if self._runs_into_another(tip):
+                found.append((tip, "an end beside another ridge", 0.25))
         return found
+
+    def _runs_into_another(self, tip: int) -> bool:
+        segment = self.segments[tip // 2]
+        others = [s for k, s in enumerate(self.segments) if k != tip // 2]
+        others.append(segment[: -2 * ARM] if tip % 2 else segment[2 * ARM :])
+        points = np.concatenate(others)
+        distance = np.linalg.norm(points - segment[-(tip % 2)], axis=1)
+        return bool(len(points) and distance.min() < _TOUCHING_PX)
 
 
 def merge_ends(ridges: Ridges, config: InitializationConfig) -> Merged:
     """Pairs up the ends so that all merges and free ends together cost least (almost: by exchange)."""
     if not ridges.segments:
-        return Merged({}, {})
+        return Merged((), {}, {})
     merges = price_merges(ridges, config)
     price = {
         (int(i), int(j)): float(c) for (i, j), c in zip(merges.pairs, merges.cost, strict=True)
@@ -84,8 +94,48 @@ def merge_ends(ridges: Ridges, config: InitializationConfig) -> Merged:
     order = np.argsort(merges.cost)
     _pair(partner, merges.pairs[order[merges.cost[order] < 1]])
     _exchange(partner, price)
+    segments = _share(ridges.segments, partner, price)
     _pair(partner, merges.pairs[order[merges.touching[order]]])
-    return Merged(partner, price)
+    return Merged(segments, partner, price)
+
+
+def _share(
+    segments: tuple[Float64, ...], partner: dict[int, int], price: dict[tuple[int, int], float]
+) -> tuple[Float64, ...]:
+    """Doubles the segments that a second strand waits for at both ends."""
+    free: dict[int, list[tuple[float, int]]] = {}
+    for (i, j), cost in price.items():
+        if i in partner and j not in partner and cost < 2 * _FREE_END:
+            free.setdefault(i, []).append((cost, j))
+    copies = list(segments)
+    for k, segment in enumerate(segments):
+        start, stop = 2 * k, 2 * k + 1
+        if start not in free or stop not in free:
+            continue
+        (_, one), (_, other) = min(free[start]), min(free[stop])
+        if one == other or one in partner or other in partner:
+            continue
+        copy = 2 * len(copies)
+        copies.append(segment)
+        price |= {(copy + (e & 1), j): c for (e, j), c in price.items() if e in (start, stop)}
+        price |= {(j, e): c for (e, j), c in price.items() if e in (copy, copy + 1)}
+        last = partner[stop]
+        # Of the two ways to connect the strands none may close a loop.
+        if _leads_to(one, partner) == other:
+            pairs = [(one, copy), (copy + 1, last), (stop, other)]
+        else:
+            pairs = [(one, copy), (copy + 1, other)]
+        for i, j in pairs:
+            partner[i], partner[j] = j, i
+    return tuple(copies)
+
+
+def _leads_to(end: int, partner: dict[int, int]) -> int:
+    """The free end at the other side of the chain of segments that begins at the free `end`."""
+    end ^= 1
+    while end in partner:
+        end = partner[end] ^ 1
+    return end
 
 
 def follow(start: int, partner: dict[int, int]) -> list[int]:
