@@ -74,7 +74,8 @@ class Reader(Generic[T]):
     """
 
     def __init__(self, bus: Bus, topic: Topic[T], depth: int):
-        self._bus, self._topic = bus, topic
+        self.topic = topic
+        self._bus = bus
         self._inbox: Inbox[tuple[str, Packet]] = Inbox(bus.stop, depth)
         self._next: dict[tuple[str, str], int] = {}
         self.lost = 0
@@ -102,7 +103,10 @@ class Reader(Generic[T]):
         sender = (key, header.publisher)
         if len(self._next) >= _MOST_PUBLISHERS and sender not in self._next:
             self._next.clear()
-        self.lost += max(0, header.number - self._next.get(sender, header.number))
+        gap = max(0, header.number - self._next.get(sender, header.number))
+        if gap and self.topic.keep == "every":
+            self._bus.complain(f"{gap} messages on {key} were lost on the way")
+        self.lost += gap
         self._next[sender] = header.number + 1
         self._inbox.put((key, packet))
 
@@ -115,7 +119,7 @@ class Reader(Generic[T]):
             if item is None:
                 return None
             try:
-                return self._bus.open(self._topic, *item)
+                return self._bus.open(self.topic, *item)
             except WireError as error:
                 self.refuse(f"{item[0]}: {error}")
 
@@ -161,8 +165,8 @@ class Bus:
 
     @property
     def dropped(self) -> int:
-        """Messages that were sent to this process and never read."""
-        return sum(reader.dropped for reader in self.readers)
+        """Frames and fields that were sent to this process and never read."""
+        return sum(r.dropped for r in self.readers if r.topic.keep == "newest")
 
     @property
     def refused(self) -> int:

@@ -84,7 +84,8 @@ class Service:
     def record(self, rig: StereoRig, config: object) -> Recorder:
         """Opens the recording; it is closed with the service."""
         run_dir, level = self.config.run_dir, self.config.recording
-        self.recorder = Recorder(run_dir, self.name, level, rig, config)
+        patient = self.config.lockstep
+        self.recorder = Recorder(run_dir, self.name, level, rig, config, patient=patient)
         return self.recorder
 
     def ready(self) -> None:
@@ -110,7 +111,7 @@ class Service:
         if now - self._last_complaint >= _COMPLAINT_INTERVAL_S:
             self._last_complaint = now
             self._complaints.append(text)
-            log.warning("%s (%d refused so far)", text, self.bus.refused)
+            log.warning("%s", text)
 
     def health(self) -> Health:
         """The heartbeat as of now; begins a new window of its figures."""

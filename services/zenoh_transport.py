@@ -97,6 +97,8 @@ def local_config(rig: str, process: str) -> zenoh.Config:
             "period_increase_factor": 2,
         },
         "transport/link/rx/max_message_size": _LARGEST_MESSAGE,
+        # Room for hundreds of states, so that none is dropped while a machine is short of time.
+        "transport/link/tx/queue/size/interactive_high": 16,
     }
     config = zenoh.Config()
     for key, value in settings.items():
@@ -249,7 +251,6 @@ class ZenohTransport:
                 key,
                 congestion_control=control.BLOCK if self._patient else control.DROP,
                 priority=priority.DATA if large else priority.INTERACTIVE_HIGH,
-                express=not large,
                 reliability=zenoh.Reliability.RELIABLE,
             )
         return self._publishers[key]
