@@ -1,48 +1,44 @@
 """Each process's own Rerun recording of what it saw and decided.
 
-The stream writes to a file and nowhere else, so that no viewer can slow or stop the process.
+The stream writes to a file and nowhere else, from a thread of its own, so that neither a viewer nor a
+disk can slow or stop the process.
 """
 
 from __future__ import annotations
 
 import logging
-import platform
+import queue
+import threading
 import time
-import uuid
-from collections.abc import Iterable
-from importlib.metadata import version
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
-import msgspec
 import rerun as rr
 
-from services import drawing
-from services.drawing import Entry, Level
-from services.writer import Writer
+from services.drawing import Level
+from services.messages import Health
+from services.run_file import RunFile
 from suturetrack.camera import StereoRig
-from suturetrack.types import InputError, Stamp
-
-APPLICATION = "suturetrack"
-RECORDING_VERSION = 1
-"""Grows when an older reader could misread a recording."""
+from suturetrack.initialization import Initialization, InitializationError
+from suturetrack.types import RidgeField, Stamp, StereoFrame, ThreadState, Truth
 
 _log = logging.getLogger(__name__)
-_LONGEST_FLUSH_SECONDS = 0.05
-_STALLED_FLUSHES = 30
+_BACKLOG = 32
+"""Values that may wait for the disk."""
+_STALL_SECONDS = 5.0
+_CLOSING_SECONDS = 10.0
 
 
-class Recorder(Writer):
-    """Writes `<run_dir>/<process>.rrd`; nothing at all without a run folder.
+class Recorder:
+    """Records one process's values to `<run_dir>/<process>.rrd`; nothing without a run folder.
 
-    A recording that cannot go on (full disk, removed folder) is closed with a loud message and a
-    `problem`, while the process goes on. Long runs roll over into parts `<process>.1.rrd`, ...;
-    so does a process that was started again.
+    Every function returns at once and may be given buffers that are used again. When the disk cannot
+    keep up, values are left out and counted; when it fails, recording ends with a loud message. Either
+    way there is a `problem`, and the process goes on.
     """
-
-    problem: str | None = None
-    """Why nothing is recorded any more."""
 
     def __init__(
         self,
@@ -51,6 +47,8 @@ class Recorder(Writer):
         level: Level,
         rig: StereoRig,
         config: object = None,
+        *,
+        patient: bool = True,
         flush_seconds: float = 1.0,
         part_bytes: int = 1 << 30,
     ) -> None:
@@ -62,27 +60,28 @@ class Recorder(Writer):
             level: "light" (JPEG) or "full" (lossless images and fields).
             rig: the calibrated cameras.
             config: the process's parameters, a dataclass.
+            patient: wait for a slow disk rather than leave something out.
             flush_seconds: what a killed process loses at most.
             part_bytes: size at which the next part begins.
 
         Raises:
             InputError: the file cannot be made.
         """
-        super().__init__(None, process, level, rig)
-        self._config, self._flush_seconds, self._part_bytes = config, flush_seconds, part_bytes
-        self._flushed = time.monotonic()
-        self._stalls = 0
+        self.process = process
+        self.left_out = 0
+        """Values that were not recorded because the disk could not keep up."""
+        self._patient, self._pause = patient, max(flush_seconds, 0.01)
+        self._stuck = False
+        self._busy_since: float | None = None
+        self._file: RunFile | None = None
         if run_dir is None:
             return
-        self._run_dir = Path(run_dir)
-        try:
-            self._run_dir.mkdir(parents=True, exist_ok=True)
-            # One name for all processes of the run makes their files one recording.
-            run = uuid.uuid5(uuid.NAMESPACE_URL, str(self._run_dir.resolve()))
-            self.stream = rr.RecordingStream(APPLICATION, recording_id=str(run))
-            self._open_part()
-        except (OSError, RuntimeError) as error:
-            raise InputError(f"recording: cannot write to {run_dir}: {error}") from error
+        self._file = RunFile(run_dir, process, level, rig, config, flush_seconds, part_bytes)
+        self._tasks: queue.Queue[Callable[[RunFile], None] | None] = queue.Queue(_BACKLOG)
+        self._worker = threading.Thread(
+            target=self._work, args=(self._file,), name="recording", daemon=True
+        )
+        self._worker.start()
 
     def __enter__(self) -> Self:
         return self
@@ -95,72 +94,105 @@ class Recorder(Writer):
     ) -> None:
         self.close()
 
+    @property
+    def problem(self) -> str | None:
+        """What is wrong with the recording, in words."""
+        if self._file is None:
+            return None
+        if self._file.problem is not None:
+            return self._file.problem
+        if self._stuck or self._is_stuck():
+            return f"recording stopped: the disk is full or too slow ({self.process})"
+        return f"{self.left_out} values not recorded: the disk is slow" if self.left_out else None
+
+    def frame(self, frame: StereoFrame, published_ns: int | None = None) -> None:
+        """Records both images; `published_ns` is now when not given."""
+        if self._file is not None:
+            copy = replace(frame, left=frame.left.copy(), right=frame.right.copy())
+            at = published_ns or time.time_ns()
+            self._hand_over(lambda file: file.frame(copy, at))
+
+    def field(self, field: RidgeField, published_ns: int | None = None) -> None:
+        """Records both fields."""
+        if self._file is not None:
+            copy = replace(field, left=field.left.copy(), right=field.right.copy())
+            at = published_ns or time.time_ns()
+            self._hand_over(lambda file: file.field(copy, at))
+
+    def states(self, states: Sequence[ThreadState], published_ns: int | None = None) -> None:
+        """Records the states of all threads at one frame; lengths in the calibration's unit."""
+        at = published_ns or time.time_ns()
+        self._hand_over(lambda file: file.states(states, at))
+
+    def initialization(
+        self, stamp: Stamp, thread: str, result: Initialization | InitializationError
+    ) -> None:
+        """Records how a thread was looked for in one field; the timeline `growth` counts the steps."""
+        self._hand_over(lambda file: file.initialization(stamp, thread, result))
+
+    def truth(self, truth: Truth) -> None:
+        """Records where a synthetic thread really is."""
+        self._hand_over(lambda file: file.truth(truth))
+
+    def health(self, health: Health) -> None:
+        """Records the process's heartbeat, at its newest frame."""
+        self._hand_over(lambda file: file.health(health))
+
+    def log(self, text: str, level: str = "INFO") -> None:
+        """Records a line of the process's log (DEBUG, INFO, WARN, ERROR), at the newest frame."""
+        self._hand_over(lambda file: file.log(text, level))
+
     def close(self) -> None:
         """Completes the file; nothing is recorded afterwards."""
-        if self.stream is not None:
-            self.stream.disconnect()
-        self.stream = None
-
-    def write(self, stamp: Stamp | None, entries: Iterable[Entry]) -> None:
-        """Writes, and looks after the file."""
-        super().write(stamp, entries)
-        self._flush_if_due()
-
-    def _flush_if_due(self) -> None:
-        """When it is time: sends to the disk what is waiting, begins a new part, looks for trouble."""
-        if self.stream is None or time.monotonic() - self._flushed < self._flush_seconds:
+        if self._file is None:
             return
-        self._flushed = time.monotonic()
-        trouble = self._care_for(self.stream)
-        if trouble:
-            self.problem = f"recording stopped: {trouble} ({self._path})"
-            _log.error("%s; everything else goes on", self.problem)
-            self.close()
+        deadline = time.monotonic() + _CLOSING_SECONDS
+        while self._worker.is_alive() and time.monotonic() < deadline and not self._gives_up():
+            try:
+                self._tasks.put(None, timeout=0.1)
+                break
+            except queue.Full:
+                continue
+        while self._worker.is_alive() and time.monotonic() < deadline and not self._gives_up():
+            self._worker.join(0.1)
+        if self._worker.is_alive():
+            # What Rerun does at exit would wait for the same disk.
+            rr.unregister_shutdown()
+        self._file = None
 
-    def _care_for(self, stream: rr.RecordingStream) -> str | None:
-        """What is wrong with the file, if anything."""
-        try:
-            stream.flush(timeout_sec=_LONGEST_FLUSH_SECONDS)
-            self._stalls = 0
-            if self._path.stat().st_size >= self._part_bytes:
-                self._open_part()
-        except FileNotFoundError:
-            return "the file or its folder was removed"
-        except (OSError, RuntimeError) as error:
-            self._stalls += 1
-            if "timed out" not in str(error):
-                return "the disk is full or cannot be written"
-            if self._stalls >= _STALLED_FLUSHES:
-                return "the disk is too slow"
-        return None
+    def _hand_over(self, task: Callable[[RunFile], None]) -> None:
+        if self._file is None or self._file.problem is not None:
+            return
+        while not self._gives_up():
+            try:
+                self._tasks.put(task, block=self._patient, timeout=0.1)
+                return
+            except queue.Full:
+                if not self._patient:
+                    break
+        self.left_out += 1
 
-    def _open_part(self) -> None:
-        """Directs the stream to the next free file; every part explains itself."""
-        assert self.stream is not None
-        name, number = self._run_dir / f"{self.process}.rrd", 0
-        while name.exists():
-            number += 1
-            name = self._run_dir / f"{self.process}.{number}.rrd"
-        self._path = name
-        sink = rr.FileSink(str(name))
-        self.stream.set_sinks(sink, default_blueprint=self.layout())
-        self.stream.send_recording_name(self._run_dir.name)
-        self.stream.reset_time()
-        self.describe()
-        self.write_static(self._about())
+    def _gives_up(self) -> bool:
+        """Whether the disk has not answered for too long; says so once."""
+        if not self._stuck and self._is_stuck():
+            self._stuck = True
+            if self._file is not None and self._file.problem is None:
+                _log.error("%s; everything else goes on", self.problem)
+        return self._stuck
 
-    def _about(self) -> list[Entry]:
-        about: dict[str, Any] = {
-            "recording_version": RECORDING_VERSION,
-            "level": self.level,
-            "started_ns": time.time_ns(),
-            "machine": f"{platform.node()}, {platform.machine()}, {platform.system()}",
-            "python": platform.python_version(),
-            **{p: version(p) for p in ("suturetrack", "numpy", "opencv-python-headless")},
-        }
-        settings = {} if self._config is None else msgspec.to_builtins(self._config, enc_hook=str)
-        text = msgspec.yaml.encode(settings).decode()
-        return [
-            (f"/run/{self.process}", drawing.values("About", about)),
-            (f"/run/{self.process}/parameters", rr.TextDocument(text)),
-        ]
+    def _is_stuck(self) -> bool:
+        since = self._busy_since
+        return since is not None and time.monotonic() - since > _STALL_SECONDS
+
+    def _work(self, file: RunFile) -> None:
+        """The recording thread: one value after the other, and a look at the file in quiet times."""
+        while True:
+            try:
+                task = self._tasks.get(timeout=self._pause)
+            except queue.Empty:
+                task = RunFile.flush_if_due
+            self._busy_since = time.monotonic()
+            (task or RunFile.close)(file)
+            self._busy_since = None
+            if task is None:
+                return

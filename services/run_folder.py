@@ -19,7 +19,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
-from services.recording import APPLICATION, RECORDING_VERSION
+from services.run_file import APPLICATION, RECORDING_VERSION
 from suturetrack.camera import Camera, StereoRig
 from suturetrack.types import (
     Energies,

@@ -19,7 +19,7 @@ import tyro
 from services import topics
 from services.bus import Bus, NoAnswer
 from services.live import LiveView
-from services.recording import APPLICATION
+from services.run_file import APPLICATION
 from services.run_folder import RunFolder
 from services.service import ServiceConfig
 from services.service import run as run_service

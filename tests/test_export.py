@@ -149,7 +149,7 @@ def test_recordings_of_others_and_of_the_future_are_named(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("services.recording.RECORDING_VERSION", 7)
+    monkeypatch.setattr("services.run_file.RECORDING_VERSION", 7)
     record(tmp_path, rig, [make_state(curve, i) for i in range(3)])
     stream = rr.RecordingStream("another_program")
     stream.set_sinks(rr.FileSink(str(tmp_path / "other.rrd")))
