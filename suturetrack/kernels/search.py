@@ -64,14 +64,21 @@ def magnitudes(field: Float32, pixels: Float64) -> Float64:
 
 @numba.njit(cache=True, nogil=True)
 def normal_profiles(
-    field: Float32, pixels: Float64, tangents: Float64, offsets: Float64
+    field: Float32, pixels: Float64, tangents: Float64, offsets: Float64, leniency: float = 0.0
 ) -> Float64:
-    """(k, m) responses at the m offsets along the normals (-tv, tu) of the k samples."""
+    """(k, m) responses at the m offsets along the normals (-tv, tu) of the k samples.
+
+    `leniency` is the share of |V| itself, whatever its direction, in the response.
+    """
     out = np.empty((len(pixels), len(offsets)))
     for j in range(len(pixels)):
         u, v, tu, tv = pixels[j, 0], pixels[j, 1], tangents[j, 0], tangents[j, 1]
         for i in range(len(offsets)):
-            out[j, i] = response_at(field, u - offsets[i] * tv, v + offsets[i] * tu, tu, tv)
+            x, y = u - offsets[i] * tv, v + offsets[i] * tu
+            out[j, i] = response_at(field, x, y, tu, tv)
+            if leniency > 0:
+                any_way = out[j, i] + response_at(field, x, y, -tv, tu)
+                out[j, i] += leniency * (any_way - out[j, i])
     return out
 
 

@@ -107,6 +107,9 @@ def _outer_boundary(x: Float64, mean: Float64, least: Float64) -> float | None:
 _DRAWN_PX = 6.0
 _SETTLING_S = 0.3
 _HELD_S = 1.5
+# A length that has kept within this part for so long is the thread's own.
+_STEADY = 0.015
+_SETTLED_S = 0.7
 _FORGOTTEN_S = 3.0
 _NS = 1e-9
 
@@ -116,14 +119,15 @@ class EndWatch:
 
     What one end loses and the other gains is the thread sliding along itself. A thread that is
     suddenly shorter is hidden, one that is suddenly longer than it ever was has met something that
-    looks like it: its length is then held.
+    looks like it: its length is then held for a while, the more firmly the longer it was steady.
     """
 
     def __init__(self, length: float, now_ns: int) -> None:
         self._found_ns = now_ns
         self._last_ns = now_ns
         self._seen_ns = [now_ns, now_ns]
-        self.length = self._longest = length
+        self._steady_ns = now_ns
+        self.length = self._longest = self._steady = length
         self.seen = (True, True)
 
     def moves(
@@ -168,16 +172,19 @@ class EndWatch:
         slack = _DRAWN_PX * max(step.pixel for step in shown) * length
         total = length * (1.0 + sum(offsets))
         if total > max(self.length, self._longest) + slack:
-            return [int(np.argmax(offsets))]
-        if total < self.length - slack:
-            hidden = [end for end in (0, 1) if offsets[end] <= min(offsets) / 2]
-            return [end for end in hidden if (now_ns - self._seen_ns[end]) * _NS < _HELD_S]
-        return []
+            doubted = [int(np.argmax(offsets))]
+        elif total < self.length - slack:
+            doubted = [end for end in (0, 1) if offsets[end] <= min(offsets) / 2]
+        return [end for end in doubted if (now_ns - self._seen_ns[end]) * _NS < _HELD_S]
 
     def _remember(
         self, length: float, steps: tuple[EndStep | None, EndStep | None], now_ns: int
     ) -> None:
-        self.length = length
+        if abs(length / self._steady - 1) > _STEADY:
+            self._steady, self._steady_ns = length, now_ns
+        self._steady += 0.02 * (length - self._steady)
+        settled = (now_ns - self._steady_ns) * _NS > _SETTLED_S
+        self.length = self._steady if settled else length
         if not any(step and step.at_border for step in steps):
             fading = np.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)
             self._longest = max(length, length + (self._longest - length) * float(fading))

@@ -15,13 +15,13 @@ from suturetrack.tracking.control_points import rearrange, respace
 from suturetrack.tracking.ends import EndWatch, find_end
 from suturetrack.tracking.energies import energies
 from suturetrack.tracking.motion import Motion
-from suturetrack.tracking.reliability import Evidence, judge
+from suturetrack.tracking.reliability import Doubt, Evidence, judge
 from suturetrack.tracking.sampling import Samples, views
 from suturetrack.types import Nurbs, RidgeField, Status, ThreadState
 
 _NS = 1e-9
 # Searches, in units of the first: tried where less than the second is seen, taken if they show more.
-_REACHES = ((1.0, 1.0, 0.0), (2.5, 0.95, 0.02), (6.5, 0.6, 0.1))
+_REACHES = ((1.0, 1.0, 0.0), (2.5, 0.985, 0.005), (6.5, 0.8, 0.05))
 
 
 @dataclass
@@ -46,6 +46,9 @@ class Follower:
         now = field.stamp.capture_ns
         curve, _, _ = rearrange(curve, rig)
         levels = measure_levels(curve, field, rig)
+        self.last_good = curve
+        """The curve when it was last tracked."""
+        self._doubt = Doubt()
         self.model = Model(
             curve, Motion.none(), levels, now, now, EndWatch(nurbs.length(curve), now)
         )
@@ -65,9 +68,11 @@ class Follower:
             evidence, inserted, removed = self._follow_by_forces(field)
         else:
             evidence, inserted, removed = self._follow_by_least_squares(field, seconds)
+        seen = evidence.evenly()[1]
+        self._doubt.grow(before, model.curve, seen, self.rig)
         if self.config.method != "paper":
             model.motion = model.motion.learn(
-                before, model.curve, evidence.evenly()[1], model.ends.seen, self.rig, seconds
+                before, model.curve, seen, model.ends.seen, self.rig, seconds
             )
         if evidence.share >= 0.5:
             model.seen_ns = model.capture_ns
@@ -76,7 +81,8 @@ class Follower:
         if inserted or removed:
             events.append(f"control points: {inserted} inserted, {removed} removed")
         astray = evidence.astray(field, self.rig, model.levels)
-        status = judge(evidence, astray, (model.capture_ns - model.seen_ns) * _NS)
+        unseen_s = (model.capture_ns - model.seen_ns) * _NS
+        status = judge(evidence, astray, self._doubt.share, unseen_s)
         if status is Status.TRACKING:
             self.last_good = model.curve
         return self._state(field, thread, evidence, status, events)
@@ -134,6 +140,7 @@ class Follower:
     ) -> ThreadState:
         model = self.model
         sigma, seen = evidence.evenly()
+        depth = nurbs.evaluate(model.curve, np.linspace(0, 1, len(sigma)))[:, 2]
         cutoffs = model.levels[0] / 2, model.levels[1] / 2
         return ThreadState(
             stamp=field.stamp,
@@ -142,7 +149,7 @@ class Follower:
             curve=model.curve,
             length=nurbs.length(model.curve),
             energies=energies(model.curve, field, self.rig, cutoffs),
-            sigma=sigma,
+            sigma=np.hypot(sigma, self._doubt.px * depth / self.rig.focal),
             seen=seen,
             events=tuple(events),
         )

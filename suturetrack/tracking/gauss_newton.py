@@ -31,6 +31,8 @@ _REFINED_PX = 3.0
 _SHORTEST_RUN_PX = 10.0
 _OUTLIER_PX = 1.0
 _HIDDEN_DRIFT_PX = 3.0
+# A first search does not know the thread's direction yet where it has bent.
+_LENIENCY = 0.4
 _EVEN = 150.0
 
 
@@ -71,7 +73,8 @@ def search_normals(
     """Looks for the thread along the normals of the samples, as one continuous line."""
     half = round(reach_px / _STEP_PX)
     grid = _STEP_PX * np.arange(-half, half + 1)
-    profiles = search.normal_profiles(image, view.pixels, view.tangents, grid)
+    leniency = _LENIENCY if reach_px > _REFINED_PX else 0.0
+    profiles = search.normal_profiles(image, view.pixels, view.tangents, grid, leniency)
     gain = np.minimum(profiles / level, 1.0) - 0.1 * (grid / reach_px) ** 2
     path = search.best_path(gain, _ROUGHNESS * _STEP_PX**2, 4)
     position, response = search.peaks(profiles, path, round(_PEAK_HALF_PX / _STEP_PX))

@@ -8,9 +8,10 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
+from suturetrack.nurbs import evaluate
 from suturetrack.tracking.gauss_newton import Fit
 from suturetrack.tracking.sampling import Samples, views
-from suturetrack.types import Bool, Float64, RidgeField, Status
+from suturetrack.types import Bool, Float64, Nurbs, RidgeField, Status
 
 RELIABILITY_SAMPLES = 64
 _NEAR_PX = 1.5
@@ -19,8 +20,11 @@ _CLEAR = 0.5
 # Shares of the curve's length.
 _MOST = 0.5
 _SOME = 0.2
-_ASTRAY = 0.08
+_ASTRAY = 0.05
 _LOST_AFTER_S = 0.2
+_DRIFT = 0.35
+_DRIFT_AT_REST_PX = 0.2
+_ANYWHERE_PX = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +73,39 @@ class Evidence:
         return float(np.sum(samples.share[unseen] * beside))
 
 
-def judge(evidence: Evidence, astray: float, unseen_s: float) -> Status:
-    """The status of a curve of which more than half was last seen `unseen_s` seconds ago."""
-    if astray > _ASTRAY:
+class Doubt:
+    """How far what is not seen may have moved away, px, at evenly spaced parameters.
+
+    It grows with the curve's own motion there: a hidden stretch of a thread at rest stays where it
+    was, one that was moving fast may be anywhere.
+    """
+
+    def __init__(self) -> None:
+        self.px: Float64 = np.zeros(RELIABILITY_SAMPLES)
+
+    def grow(self, before: Nurbs, after: Nurbs, seen: Bool, rig: StereoRig) -> None:
+        """One field later, in which the curve moved from `before` to `after`."""
+        s = np.linspace(0, 1, RELIABILITY_SAMPLES)
+        moved = rig.project(evaluate(after, s))[0] - rig.project(evaluate(before, s))[0]
+        drift = _DRIFT * np.linalg.norm(moved, axis=1) + _DRIFT_AT_REST_PX
+        self.px = np.where(seen, 0.0, np.hypot(self.px, drift))
+
+    @property
+    def share(self) -> float:
+        """Share of the curve that may be anywhere."""
+        return float(np.mean(self.px > _ANYWHERE_PX))
+
+
+def judge(evidence: Evidence, astray: float, doubted: float, unseen_s: float) -> Status:
+    """The status of a curve.
+
+    Args:
+        evidence: what the field says about it.
+        astray: share of it beside which a thread runs.
+        doubted: share of it that may be anywhere.
+        unseen_s: time since half of it was last seen.
+    """
+    if astray > _ASTRAY or doubted > _ASTRAY:
         return Status.LOST
     if evidence.share >= _MOST:
         return Status.TRACKING
