@@ -171,3 +171,46 @@ def solid(flags: Bool, lengths: Float64, least: float) -> Bool:
         if total < least:
             kept[start:j] = False
     return kept
+
+
+@numba.njit(cache=True, nogil=True)
+def doubled_tail(
+    pixels: Float64, tangents: Float64, along: Float64, near: float, apart: float, stray: int
+) -> int:
+    """How many of the first samples of a curve only repeat a later part of it.
+
+    Args:
+        pixels: (2, k, 2) of the samples in both images.
+        tangents: (2, k, 2) unit tangents.
+        along: (k,) px travelled along the curve to each sample.
+        near: a sample repeats another that is nearer than this in both images, and parallel.
+        apart: what is nearer than this along the curve does not count.
+        stray: so many samples in a row may lie elsewhere.
+    """
+    last, missed = 0, 0
+    for j in range(len(along)):
+        found = False
+        for i in range(len(along) - 1, j, -1):
+            if along[i] - along[j] < apart:
+                break
+            same = True
+            for view in range(2):
+                du = pixels[view, i, 0] - pixels[view, j, 0]
+                dv = pixels[view, i, 1] - pixels[view, j, 1]
+                parallel = (
+                    tangents[view, i, 0] * tangents[view, j, 0]
+                    + tangents[view, i, 1] * tangents[view, j, 1]
+                )
+                if du * du + dv * dv > near * near or abs(parallel) < 0.9:
+                    same = False
+                    break
+            if same:
+                found = True
+                break
+        if found:
+            last, missed = j + 1, 0
+        else:
+            missed += 1
+            if missed > stray:
+                break
+    return last

@@ -9,7 +9,7 @@ import numpy as np
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.nurbs import derivative, evaluate
-from suturetrack.tracking.sampling import views
+from suturetrack.tracking.sampling import Samples, views
 from suturetrack.types import Float64, Nurbs, RidgeField
 
 _STEP_PX = 0.5
@@ -188,6 +188,31 @@ class EndWatch:
         if not any(step and step.at_border for step in steps):
             fading = np.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)
             self._longest = max(length, length + (self._longest - length) * float(fading))
+
+
+def doubled_ends(curve: Nurbs, rig: StereoRig) -> tuple[float, float]:
+    """Parts of the curve at its start and its stop that lie on another part of it.
+
+    Strands that cross are not parallel, and strands side by side are further apart.
+    """
+    samples = Samples.of(curve.knots, 4)
+    both = views(rig, samples.values(curve.control_points), samples.values(curve.control_points, 1))
+    along = np.cumsum(samples.share * both[0].speed)
+    pixels = np.stack([view.pixels for view in both])
+    tangents = np.stack([view.tangents for view in both])
+    start = _doubled(pixels, tangents, along)
+    stop = _doubled(pixels[:, ::-1], tangents[:, ::-1], along[-1] - along[::-1])
+    return (
+        float(samples.s[start]) if start else 0.0,
+        1.0 - float(samples.s[-1 - stop]) if stop else 0.0,
+    )
+
+
+def _doubled(pixels: Float64, tangents: Float64, along: Float64) -> int:
+    count = search.doubled_tail(
+        np.ascontiguousarray(pixels), np.ascontiguousarray(tangents), along, 2.0, 25.0, 2
+    )
+    return count if count < len(along) // 2 and along[count] > _SOLID_PX else 0
 
 
 def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:

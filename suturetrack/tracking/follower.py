@@ -12,7 +12,7 @@ from suturetrack.kernels import search
 from suturetrack.tracking import gauss_newton, paper
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange, respace
-from suturetrack.tracking.ends import EndWatch, find_end
+from suturetrack.tracking.ends import EndWatch, doubled_ends, find_end
 from suturetrack.tracking.energies import energies
 from suturetrack.tracking.motion import Motion
 from suturetrack.tracking.reliability import Doubt, Evidence, judge
@@ -21,7 +21,9 @@ from suturetrack.types import Nurbs, RidgeField, Status, ThreadState
 
 _NS = 1e-9
 # Searches, in units of the first: tried where less than the second is seen, taken if they show more.
-_REACHES = ((1.0, 1.0, 0.0), (2.5, 0.985, 0.005), (6.5, 0.8, 0.05))
+_WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
+_DROP = 0.01
+_RETRY = 5
 
 
 @dataclass
@@ -49,6 +51,7 @@ class Follower:
         self.last_good = curve
         """The curve when it was last tracked."""
         self._doubt = Doubt()
+        self._share = 1.0
         self.model = Model(
             curve, Motion.none(), levels, now, now, EndWatch(nurbs.length(curve), now)
         )
@@ -101,25 +104,34 @@ class Follower:
     def _follow_by_least_squares(
         self, field: RidgeField, seconds: float
     ) -> tuple[Evidence, int, int]:
-        model, config = self.model, self.config
+        model = self.model
         predicted = model.motion.predict(model.curve, seconds)
-        best: Evidence | None = None
-        for reach, enough, gain in _REACHES:
-            if best is not None and best.share >= enough:
-                break
-            tried = Evidence.of(
-                gauss_newton.fit(
-                    predicted, field, self.rig, model.levels, reach * config.search_px, config
-                )
-            )
-            if best is None or tried.share > best.share + gain:
-                best = tried
-        assert best is not None
+        best = self._search(predicted, field)
         model.curve = best.fit.curve
         if best.share > 0.3:
             self._adjust_ends(field)
+        start, stop = doubled_ends(model.curve, self.rig)
+        if start or stop:
+            model.curve = nurbs.part(model.curve, start, 1.0 - stop)
         model.curve, inserted, removed = rearrange(model.curve, self.rig)
         return best, inserted, removed
+
+    def _search(self, predicted: Nurbs, field: RidgeField) -> Evidence:
+        """Looks further away for what was seen before, and now and then for what is hidden."""
+        levels, config = self.model.levels, self.config
+        best = Evidence.of(
+            gauss_newton.fit(predicted, field, self.rig, levels, config.search_px, config)
+        )
+        usual = 1.0 if field.stamp.frame % _RETRY == 0 else self._share - _DROP
+        for times, enough, gain in _WIDER:
+            if best.share >= min(enough, usual):
+                break
+            reach = times * config.search_px
+            tried = Evidence.of(gauss_newton.fit(predicted, field, self.rig, levels, reach, config))
+            if tried.share > best.share + gain:
+                best = tried
+        self._share = best.share
+        return best
 
     def _adjust_ends(self, field: RidgeField) -> None:
         model = self.model
