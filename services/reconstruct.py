@@ -8,10 +8,10 @@ from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import cv2
 import numpy as np
 import tyro
 
+from services.sources.footage import halves, read_image
 from suturetrack import nurbs
 from suturetrack.calibration import load_calibration
 from suturetrack.camera import StereoRig
@@ -93,27 +93,11 @@ def _load(config: ReconstructConfig) -> tuple[Image, Image]:
     if config.layout == "side-by-side":
         if config.right is not None:
             raise InputError("--layout side-by-side takes one image; leave the right one out")
-        both = _read(config.left)
-        if both.shape[1] % 2:
-            raise InputError(
-                f"{config.left}: {both.shape[1]} columns do not halve; is it side by side?"
-            )
-        middle = both.shape[1] // 2
-        return np.ascontiguousarray(both[:, :middle]), np.ascontiguousarray(both[:, middle:])
+        left, right = halves(read_image(config.left), str(config.left))
+        return np.ascontiguousarray(left), np.ascontiguousarray(right)
     if config.right is None:
         raise InputError("give LEFT and RIGHT, or one image and --layout side-by-side")
-    return _read(config.left), _read(config.right)
-
-
-def _read(path: Path) -> Image:
-    if not path.is_file():
-        raise InputError(f"no image {path}")
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None or image.size == 0:
-        raise InputError(f"{path}: no image that can be read; use PNG, JPEG, TIFF or BMP")
-    if image.dtype != np.uint8:
-        raise InputError(f"{path}: {image.dtype} pixels; convert the image to 8 bit")
-    return np.ascontiguousarray(image[..., :3]) if image.ndim == 3 else image
+    return read_image(config.left), read_image(config.right)
 
 
 def _check(left: Image, right: Image, rig: StereoRig) -> None:

@@ -94,7 +94,7 @@ def washed_out(image: Image) -> Image:
         (None, halved, "differ in size"),
         (halved, halved, "the calibration is for 640x480"),
         (coloured, None, "one image is gray"),
-        (lambda i: i.astype(np.uint16) * 257, None, "convert the image to 8 bit"),
+        (lambda i: i.astype(np.uint16) * 257, None, "uint16; convert it to 8 bit"),
         (lambda i: np.full_like(i, 90), None, "left image is empty"),
         (None, lambda i: np.full_like(i, 255), "right image is empty"),
         (washed_out, None, "saturated"),

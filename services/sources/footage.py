@@ -53,9 +53,11 @@ class Footage(Protocol):
 
 def read_image(path: Path) -> Image:
     """An 8-bit image as (H, W, 3) BGR or (H, W) gray; raises InputError."""
+    if not path.is_file():
+        raise InputError(f"no image {path}")
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None or image.size == 0:
-        raise InputError(f"image {path} cannot be read")
+        raise InputError(f"image {path} cannot be read; use PNG, JPEG, TIFF or BMP")
     if image.dtype != np.uint8:
         raise InputError(f"image {path} is {image.dtype}; convert it to 8 bit")
     return np.ascontiguousarray(image[..., :3]) if image.ndim == 3 else image
