@@ -18,6 +18,8 @@ from suturetrack.types import Float32, Float64, Nurbs, RidgeField
 
 _DIFFERENCE_PX = 1.0
 _SEARCH_STEP_PX = 1.0
+# Slope of |V| along the thread, per px, below which an end feels no force.
+_FLAT_SLOPE = 0.02
 
 
 def fit(
@@ -39,7 +41,8 @@ def fit(
     for _ in range(config.iterations):
         step = _point_offsets(samples, control_points, field, rig, cutoffs, config)
         change = spline.gather(samples.first, samples.table[0], step) / np.maximum(sums, 1e-9)
-        change[[0, -1]] = step[[0, -1]]
+        change[0] = _short_of(step[0], control_points[1] - control_points[0])
+        change[-1] = _short_of(step[-1], control_points[-2] - control_points[-1])
         control_points = control_points + change
     return curve_from(curve.degree, curve.knots, control_points)
 
@@ -96,9 +99,9 @@ def _end_offsets(
     )
     if config.end_search:
         outward = np.array([-1.0, 1.0])
-        flat = np.abs(force) < config.flat_px
-        inside = np.sign(excess) * outward * config.end_search_step_px
-        force = np.where(flat, inside, force)
+        flat = np.abs(slope) < _FLAT_SLOPE
+        searched = np.sign(excess) * outward * config.end_search_step_px
+        force = np.where(flat, searched, force)
     return float(force[0]), float(force[1])
 
 
@@ -130,8 +133,19 @@ def _deproject_ends(
         tangent = first[end] / max(float(np.linalg.norm(first[end])), 1e-12)
         along = np.array([v.tangents[end] @ v.jacobian[end] @ tangent for v in both])
         measured = np.array([offset[column] for offset in offsets])
-        step[end] = tangent * (along @ measured) / max(float(along @ along), 1e-12)
+        # An end that points at the camera would be thrown far for a small offset in the image.
+        least = 0.1 * sum(float(np.sum(v.jacobian[end] ** 2)) for v in both)
+        step[end] = tangent * (along @ measured) / max(float(along @ along), least)
     return step
+
+
+def _short_of(step: Float64, neighbour: Float64) -> Float64:
+    """The step of an end, kept from passing its neighbour: the tangent there would turn round, and
+    the end would run back along the thread.
+    """
+    gap = max(float(np.linalg.norm(neighbour)), 1e-12)
+    toward = neighbour / gap
+    return step - max(float(step @ toward) - gap / 3, 0.0) * toward
 
 
 def _across(tangent: Float64) -> Float64:
