@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from suturetrack import nurbs
+from suturetrack.camera import StereoRig
 from suturetrack.kernels import search, spline
 from tests.reference import curve_fit as reference
 
@@ -92,6 +93,20 @@ def test_no_peak_at_the_rim_or_on_nothing() -> None:
     rising, empty = np.linspace(0, 1, 21), np.zeros(21)
     position, _ = search.peaks(np.stack([rising, empty]), np.array([10, 10]), 3)
     assert np.isnan(position).all()
+
+
+def test_views_are_those_of_the_rig(rig: StereoRig) -> None:
+    points = RNG.normal(0, 20, (30, 3)) + np.array([0, 0, 200])
+    derivatives = RNG.normal(size=(30, 3))
+    pixels = rig.project(points)
+    jacobians = rig.projection_jacobian(points)
+    for camera, pixel, jacobian in zip((rig.left, rig.right), pixels, jacobians, strict=True):
+        view = spline.project_samples(camera.projection, points, derivatives)
+        along = (jacobian @ derivatives[:, :, None])[:, :, 0]
+        np.testing.assert_allclose(view[0], pixel, rtol=1e-12)
+        np.testing.assert_allclose(view[1] * view[2][:, None], along, atol=1e-12)
+        np.testing.assert_allclose(view[3], jacobian, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(view[1], axis=1), 1.0)
 
 
 def test_short_runs_are_dropped() -> None:

@@ -203,3 +203,36 @@ def sample_covariance(first: Int64, values: Float64, inverse: Float64) -> Float6
                             inverse[r, r - c] if r >= c else inverse[c, c - r]
                         )
     return covariance
+
+
+@numba.njit(cache=True, nogil=True)
+def project_samples(
+    projection: Float64, points: Float64, derivatives: Float64
+) -> tuple[Float64, Float64, Float64, Float64]:
+    """One view of (k, 3) points of a curve with their derivatives by s.
+
+    Returns:
+        (k, 2) pixels, (k, 2) unit tangents, (k,) speed in px per unit of s, and (k, 2, 3) derivative
+        of the pixel by the point.
+    """
+    count = len(points)
+    pixels, tangents = np.empty((count, 2)), np.empty((count, 2))
+    speed, jacobian = np.empty(count), np.empty((count, 2, 3))
+    for j in range(count):
+        w = projection[2, 3]
+        for b in range(3):
+            w += projection[2, b] * points[j, b]
+        for a in range(2):
+            value = projection[a, 3]
+            for b in range(3):
+                value += projection[a, b] * points[j, b]
+            pixels[j, a] = value / w
+            along = 0.0
+            for b in range(3):
+                jacobian[j, a, b] = (projection[a, b] - pixels[j, a] * projection[2, b]) / w
+                along += jacobian[j, a, b] * derivatives[j, b]
+            tangents[j, a] = along
+        speed[j] = np.hypot(tangents[j, 0], tangents[j, 1])
+        for a in range(2):
+            tangents[j, a] /= max(speed[j], 1e-9)
+    return pixels, tangents, speed, jacobian

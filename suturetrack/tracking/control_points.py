@@ -7,8 +7,8 @@ import numpy as np
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import spline
 from suturetrack.kernels.spline import Int64
-from suturetrack.nurbs import clamped_knots, curve_from, evaluate, insert_knot
-from suturetrack.tracking.sampling import Samples, View, views
+from suturetrack.nurbs import clamped_knots, curve_from, insert_knot
+from suturetrack.tracking.sampling import Samples, View, distinct, values_at, views
 from suturetrack.types import Float64, Nurbs
 
 # A span of length h on a circle of radius r is off by about h^4 / (384 r^3).
@@ -28,9 +28,9 @@ def rearrange(curve: Nurbs, rig: StereoRig) -> tuple[Nurbs, int, int]:
     width, wanted = _spans(curve, rig)
     crowded = _crowded(width, wanted)
     if crowded:
-        curve = refit(curve, np.delete(np.unique(curve.knots)[1:-1], crowded))
+        curve = refit(curve, np.delete(distinct(curve.knots)[1:-1], crowded))
         width, wanted = _spans(curve, rig)
-    edges = np.unique(curve.knots)
+    edges = distinct(curve.knots)
     sparse = np.flatnonzero(width > _SPARSE * wanted)
     for i in sparse:
         curve = insert_knot(curve, float(edges[i] + edges[i + 1]) / 2)
@@ -54,7 +54,7 @@ def respace(
     for s in wide:
         curve = insert_knot(curve, s)
     if near:
-        interior = np.unique(curve.knots)[1:-1]
+        interior = distinct(curve.knots)[1:-1]
         curve = refit(curve, interior[~np.isin(interior, near)])
     return curve, len(wide), len(near)
 
@@ -92,7 +92,7 @@ def refit(curve: Nurbs, interior: Float64) -> Nurbs:
     band = np.zeros((3 * (len(knots) - spline.ORDER), spline.BANDWIDTH))
     right = np.zeros(len(band))
     information = weight[:, None, None] * np.eye(3)
-    pull = weight[:, None] * evaluate(curve, s)
+    pull = weight[:, None] * values_at(curve, s)
     spline.add_rows(samples.first, samples.table[0], information, pull, band, right)
     spline.factorize(band)
     return curve_from(3, knots, spline.solve_factorized(band, right).reshape(-1, 3))

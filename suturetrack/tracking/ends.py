@@ -8,8 +8,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
-from suturetrack.nurbs import derivative, evaluate
-from suturetrack.tracking.sampling import Samples, views
+from suturetrack.tracking.sampling import Samples, values_at, views
 from suturetrack.types import Float64, Nurbs, RidgeField
 
 _STEP_PX = 0.5
@@ -73,7 +72,7 @@ def find_end(
 
 
 def _smooth(profile: Float64) -> Float64:
-    padded = np.pad(profile, 2, mode="edge")
+    padded = np.r_[profile[[0, 0]], profile, profile[[-1, -1]]]
     return np.convolve(padded, np.full(5, 0.2), mode="valid")
 
 
@@ -217,7 +216,7 @@ def _doubled(pixels: Float64, tangents: Float64, along: Float64) -> int:
 
 def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:
     s = np.array([0.02, 0.0]) if end == 0 else np.array([0.98, 1.0])
-    both = views(rig, evaluate(curve, s), derivative(curve, s))
+    both = views(rig, values_at(curve, s), values_at(curve, s, 1))
     return max(float(np.mean([view.speed.mean() for view in both])), 1e-6)
 
 
@@ -226,9 +225,9 @@ def _extension(curve: Nurbs, end: int, beyond: Float64) -> tuple[Float64, Float6
     sign = 1.0 if end else -1.0
     inner = float(end) + sign * np.minimum(beyond, 0.0)
     outer = np.maximum(beyond, 0.0)[:, None]
-    points, first = evaluate(curve, inner), derivative(curve, inner)
-    bend = derivative(curve, float(end) - sign * np.linspace(0, 0.04, 5), 2).mean(axis=0)
-    tip = derivative(curve, np.array([float(end)]))
+    points, first = values_at(curve, inner), values_at(curve, inner, 1)
+    bend = values_at(curve, float(end) - sign * np.linspace(0, 0.04, 5), 2).mean(axis=0)
+    tip = values_at(curve, np.array([float(end)]), 1)
     points = points + outer * sign * tip + outer**2 / 2 * bend
     first = np.where(outer > 0, tip + sign * outer * bend, first)
     return points, first

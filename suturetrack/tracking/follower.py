@@ -16,7 +16,7 @@ from suturetrack.tracking.ends import EndWatch, doubled_ends, find_end
 from suturetrack.tracking.energies import energies
 from suturetrack.tracking.motion import Motion
 from suturetrack.tracking.reliability import Doubt, Evidence, judge
-from suturetrack.tracking.sampling import Samples, views
+from suturetrack.tracking.sampling import Samples, distinct, length_of, values_at, views
 from suturetrack.types import Nurbs, RidgeField, Status, ThreadState
 
 _NS = 1e-9
@@ -52,9 +52,7 @@ class Follower:
         """The curve when it was last tracked."""
         self._doubt = Doubt()
         self._share = 1.0
-        self.model = Model(
-            curve, Motion.none(), levels, now, now, EndWatch(nurbs.length(curve), now)
-        )
+        self.model = Model(curve, Motion.none(), levels, now, now, EndWatch(length_of(curve), now))
 
     @property
     def known_length(self) -> float:
@@ -137,7 +135,7 @@ class Follower:
         model = self.model
         steps = [find_end(model.curve, end, field, self.rig, model.levels) for end in (0, 1)]
         start, stop = model.ends.moves(
-            steps[0], steps[1], nurbs.length(model.curve), field.stamp.capture_ns
+            steps[0], steps[1], length_of(model.curve), field.stamp.capture_ns
         )
         if start or stop:
             model.curve = _with_ends(model.curve, -start, 1.0 + stop)
@@ -152,14 +150,14 @@ class Follower:
     ) -> ThreadState:
         model = self.model
         sigma, seen = evidence.evenly()
-        depth = nurbs.evaluate(model.curve, np.linspace(0, 1, len(sigma)))[:, 2]
+        depth = values_at(model.curve, np.linspace(0, 1, len(sigma)))[:, 2]
         cutoffs = model.levels[0] / 2, model.levels[1] / 2
         return ThreadState(
             stamp=field.stamp,
             thread=thread,
             status=status,
             curve=model.curve,
-            length=nurbs.length(model.curve),
+            length=length_of(model.curve),
             energies=energies(model.curve, field, self.rig, cutoffs),
             sigma=np.hypot(sigma, self._doubt.px * depth / self.rig.focal),
             seen=seen,
@@ -179,7 +177,7 @@ def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[flo
 
 
 def _with_ends(curve: Nurbs, start: float, stop: float) -> Nurbs:
-    inner = np.unique(curve.knots)[[1, -2]]
+    inner = distinct(curve.knots)[[1, -2]]
     if len(curve.control_points) > 4 and start < inner[0] and stop > inner[1]:
         return nurbs.with_ends(curve, start, stop)
     return nurbs.part(curve, max(start, 0.0), min(stop, 1.0))

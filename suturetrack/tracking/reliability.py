@@ -8,9 +8,8 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
-from suturetrack.nurbs import evaluate
 from suturetrack.tracking.gauss_newton import Fit
-from suturetrack.tracking.sampling import Samples, views
+from suturetrack.tracking.sampling import Samples, values_at, views
 from suturetrack.types import Bool, Float64, Nurbs, RidgeField, Status
 
 RELIABILITY_SAMPLES = 64
@@ -86,7 +85,7 @@ class Doubt:
     def grow(self, before: Nurbs, after: Nurbs, seen: Bool, rig: StereoRig) -> None:
         """One field later, in which the curve moved from `before` to `after`."""
         s = np.linspace(0, 1, RELIABILITY_SAMPLES)
-        moved = rig.project(evaluate(after, s))[0] - rig.project(evaluate(before, s))[0]
+        moved = rig.project(values_at(after, s))[0] - rig.project(values_at(before, s))[0]
         drift = _DRIFT * np.linalg.norm(moved, axis=1) + _DRIFT_AT_REST_PX
         self.px = np.where(seen, 0.0, np.hypot(self.px, drift))
 

@@ -10,6 +10,8 @@ from suturetrack.camera import StereoRig
 from suturetrack.kernels import spline
 from suturetrack.types import Bool, Float64, Nurbs
 
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
+
 
 @dataclass(frozen=True, eq=False)
 class Samples:
@@ -27,7 +29,7 @@ class Samples:
     @classmethod
     def of(cls, knots: Float64, per_span: int) -> Samples:
         """`per_span` samples in each knot span, evenly, clear of the knots."""
-        edges = np.unique(knots)
+        edges = distinct(knots)
         width = np.diff(edges)[:, None] / per_span
         s = (edges[:-1, None] + width * (np.arange(per_span) + 0.5)).ravel()
         return cls(s, np.repeat(width, per_span), *spline.local_basis(s, knots))
@@ -72,22 +74,28 @@ class View:
 def views(rig: StereoRig, points: Float64, derivatives: Float64) -> tuple[View, View]:
     """Both images of (k, 3) points with their derivatives by s."""
     left, right = (
-        _view(pixels, jacobian, derivatives)
-        for pixels, jacobian in zip(
-            rig.project(points), rig.projection_jacobian(points), strict=True
-        )
+        View(*spline.project_samples(camera.projection, points, derivatives))
+        for camera in (rig.left, rig.right)
     )
     return left, right
 
 
-def _view(pixels: Float64, jacobian: Float64, derivatives: Float64) -> View:
-    along = (jacobian @ derivatives[:, :, None])[:, :, 0]
-    speed = np.hypot(along[:, 0], along[:, 1])
-    return View(pixels, along / np.maximum(speed, 1e-9)[:, None], speed, jacobian)
+def values_at(curve: Nurbs, s: Float64, times: int = 0) -> Float64:
+    """(k, dim) points of a cubic curve, or derivatives, at parameters in [0, 1]."""
+    first, table = spline.local_basis(s, curve.knots)
+    return spline.combine(first, table[times], curve.control_points)
 
 
-def unit_weights(curve: Nurbs) -> Nurbs:
-    """The cubic curve itself; others are refused."""
-    if curve.degree != spline.DEGREE or np.any(curve.weights != 1):
-        raise ValueError("tracking takes cubic curves with unit weights")
-    return curve
+def length_of(curve: Nurbs) -> float:
+    """Arc length of a cubic curve, by quadrature on each knot span."""
+    edges = distinct(curve.knots)
+    half = np.diff(edges)[:, None] / 2
+    speed = np.linalg.norm(
+        values_at(curve, (edges[:-1, None] + half * (1 + _NODES)).ravel(), 1), axis=1
+    )
+    return float(np.sum(speed * (half * _WEIGHTS).ravel()))
+
+
+def distinct(knots: Float64) -> Float64:
+    """The sorted knots, each once."""
+    return knots[np.r_[True, np.diff(knots) > 0]]
