@@ -36,10 +36,18 @@ def print_rows(console: Console, title: str, rows: Sequence[Any]) -> None:
     table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
     for name in names:
         is_text = isinstance(getattr(rows[0], name), str)
-        table.add_column(name.replace("_", " "), justify="left" if is_text else "right")
+        table.add_column(
+            name.replace("_", "\n"), justify="left" if is_text else "right", no_wrap=True
+        )
     for row in rows:
         table.add_row(*(_text(getattr(row, name)) for name in names))
-    console.print(table)
+    width = console.width
+    # A narrow terminal may wrap the lines, but no figure is cut.
+    console.width = max(
+        width, console.measure(table, options=console.options.update(width=999)).maximum
+    )
+    console.print(table, crop=False)
+    console.width = width
 
 
 def write_json(path: Path, tables: Mapping[str, Sequence[Any]]) -> None:
