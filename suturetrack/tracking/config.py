@@ -24,10 +24,6 @@ class PaperConfig:
     """A force below this leaves the point to active search."""
     largest_step_px: float = 2.0
     """Longest step of a point in one update."""
-    end_search: bool = True
-    """Whether ends that feel no force are searched for along the tangent."""
-    end_search_step_px: float = 1.0
-    """Step of that search."""
     spacing_px: tuple[float, float] = (10.0, 26.0)
     """Distance of neighbouring control points below which one is pruned, above which one is inserted."""
 

@@ -18,8 +18,9 @@ from suturetrack.types import Float32, Float64, Nurbs, RidgeField
 
 _DIFFERENCE_PX = 1.0
 _SEARCH_STEP_PX = 1.0
-# Slope of |V| along the thread, per px, below which an end feels no force.
-_FLAT_SLOPE = 0.02
+# An end's tangent is that of the chord over so many samples: the last two control points come close,
+# and their direction is then noise, above all in depth.
+_CHORD = 6
 
 
 def fit(
@@ -62,8 +63,10 @@ def _point_offsets(
     config: PaperConfig,
 ) -> Float64:
     """(k, 3) Delta P: eqs. (5), (6), (8) and (10) in both images, deprojected by eq. (13)."""
-    first = samples.values(control_points, 1)
-    both = views(rig, samples.values(control_points), first)
+    points, first = samples.values(control_points), samples.values(control_points, 1)
+    reach = min(_CHORD, len(points) - 1)
+    first[0], first[-1] = points[reach] - points[0], points[-1] - points[-1 - reach]
+    both = views(rig, points, first)
     images = field.left, field.right
     normal = [_normal_offsets(i, v, config) for i, v in zip(images, both, strict=True)]
     step = _deproject_normals(both, normal, first)
@@ -97,11 +100,6 @@ def _end_offsets(
     force = np.clip(
         -2 * config.end_gain * slope * excess, -config.largest_step_px, config.largest_step_px
     )
-    if config.end_search:
-        outward = np.array([-1.0, 1.0])
-        flat = np.abs(slope) < _FLAT_SLOPE
-        searched = np.sign(excess) * outward * config.end_search_step_px
-        force = np.where(flat, searched, force)
     return float(force[0]), float(force[1])
 
 
