@@ -74,6 +74,8 @@ def _warm_up(rig: StereoRig, config: TrackerConfig) -> None:
             direction = (end - start) / np.linalg.norm(end - start)
             first, last = np.rint([start, end]).astype(int).tolist()
             cv2.line(view, first, last, direction.tolist(), 3)
+        # Fields from the wire are read-only, for which kernels are compiled anew.
+        view.flags.writeable = False
         views.append(view)
     tracker = Tracker(rig, config.tracking, config.initialization)
     u, v = rig.project_raw(thread[100])[0]
