@@ -76,8 +76,10 @@ class Reader(Generic[T]):
     def __init__(self, bus: Bus, topic: Topic[T], depth: int):
         self.topic = topic
         self._bus = bus
-        self._inbox: Inbox[tuple[str, Packet]] = Inbox(bus.stop, depth)
+        self._inbox: Inbox[tuple[str, Packet, int]] = Inbox(bus.stop, depth)
         self._next: dict[tuple[str, str], int] = {}
+        self.arrived_ns = 0
+        """When the message that was read last had arrived, by `time.monotonic_ns`."""
         self.lost = 0
         """Messages that were sent and did not arrive, by the gaps in their numbers."""
         self.refused = 0
@@ -108,7 +110,7 @@ class Reader(Generic[T]):
             self._bus.complain(f"{gap} messages on {key} were lost on the way")
         self.lost += gap
         self._next[sender] = header.number + 1
-        self._inbox.put((key, packet))
+        self._inbox.put((key, packet, time.monotonic_ns()))
 
     def get(self, timeout: float | None = None) -> T | None:
         """The next valid message; None after `timeout` seconds without one, or when stopped."""
@@ -118,10 +120,11 @@ class Reader(Generic[T]):
             item = self._inbox.get(left)
             if item is None:
                 return None
+            key, packet, self.arrived_ns = item
             try:
-                return self._bus.open(self.topic, *item)
+                return self._bus.open(self.topic, key, packet)
             except WireError as error:
-                self.refuse(f"{item[0]}: {error}")
+                self.refuse(f"{key}: {error}")
 
     def refuse(self, reason: str) -> None:
         """Counts and reports a bad message."""

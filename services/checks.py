@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.messages import Health, SeedReply
+from services.messages import GraspReply, GraspRequest, Health, SeedReply
 from suturetrack.camera import Camera, StereoRig
 from suturetrack.types import (
     Energies,
@@ -52,7 +52,7 @@ def _numbers(array: NDArray[Any], shape: tuple[int | None, ...], name: str) -> N
 
 
 def _stamp(stamp: Stamp) -> None:
-    for name in ("frame", "capture_ns", "released_ns"):
+    for name in ("frame", "capture_ns", "released_ns", "period_ns"):
         _require(0 <= getattr(stamp, name) <= LARGEST_TIME, f"{name} {getattr(stamp, name)}")
 
 
@@ -137,6 +137,21 @@ def _grasp(grasp: Grasp) -> None:
     _require(np.isfinite(grasp.sigma) and grasp.sigma >= 0, f"sigma {grasp.sigma}")
 
 
+def _grasp_request(request: GraspRequest) -> None:
+    check_name(request.thread, "thread")
+    numbers = [np.ravel(v) for v in vars(request.where).values() if v is not None]
+    _require(len(numbers) == 1, "exactly one of from_start, from_end, fraction and near")
+    _require(np.isfinite(numbers[0]).all(), "a place that is not finite")
+    _require(np.isfinite(request.approach).all() and any(request.approach), "no approach")
+
+
+def _grasp_reply(reply: GraspReply) -> None:
+    check_name(reply.thread, "thread")
+    _require((reply.grasp is None) == bool(reply.reason), "either a grasp or a reason")
+    if reply.grasp is not None:
+        _grasp(reply.grasp)
+
+
 def _health(health: Health) -> None:
     check_name(health.process, "process")
     _require(0 <= health.time_ns <= LARGEST_TIME, f"time_ns {health.time_ns}")
@@ -184,6 +199,8 @@ _CHECKS: dict[type[Any], Any] = {
     Seed: _seed,
     SeedReply: _seed_reply,
     Grasp: _grasp,
+    GraspRequest: _grasp_request,
+    GraspReply: _grasp_reply,
     Stamp: _stamp,
     Health: _health,
     StereoRig: _rig,

@@ -52,9 +52,10 @@ def run(service: Service, config: SourceConfig) -> None:
     service.ready()
     if not footage.live and not bus.wait_for_alive("segmenter"):
         return
+    period_ns = 0 if config.service.lockstep else round(1e9 / footage.fps)
     pace = _Pace(service, footage, config.input.frames)
     for index, exposure in pace:
-        stamp = Stamp(index, exposure.capture_ns, _released_ns(footage, exposure))
+        stamp = Stamp(index, exposure.capture_ns, _released_ns(footage, exposure), period_ns)
         frame = StereoFrame(stamp, exposure.left, exposure.right)
         truths = [dataclasses.replace(truth, stamp=stamp) for truth in exposure.truths]
         for truth in truths:

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from services import checks
-from services.messages import Health, SeedReply
+from services.messages import GraspReply, GraspRequest, Health, SeedReply
 from suturetrack.camera import StereoRig
 from suturetrack.types import (
     Grasp,
@@ -48,6 +48,8 @@ _SMALL: dict[type[Any], str] = {
     Seed: "seed/1",
     SeedReply: "seed-reply/1",
     Grasp: "grasp/1",
+    GraspRequest: "grasp-request/1",
+    GraspReply: "grasp-reply/1",
     Stamp: "stamp/1",
     Health: "health/1",
     StereoRig: "rig/1",
@@ -91,6 +93,8 @@ class Header(msgspec.Struct, frozen=True):
     """Wall clock when it was sent."""
     stamp: tuple[_Count, _Count, _Count] | None = None
     """Frame number, capture time and release time of raw arrays."""
+    period_ns: _Count = 0
+    """Of raw arrays: time until the next frame is due; 0 where nothing is promised."""
     dtype: _Name = ""
     shapes: Annotated[list[list[_Side]], msgspec.Meta(max_length=2)] = []
     """Of the arrays in the payload, one after another."""
@@ -110,7 +114,8 @@ def encode(message: object, publisher: str = "", number: int = 0, sent_ns: int =
         views = [np.ascontiguousarray(v, _RAW[kind][1]) for v in (message.left, message.right)]
         stamp = (message.stamp.frame, message.stamp.capture_ns, message.stamp.released_ns)
         shapes = [list(v.shape) for v in views]
-        header = Header(publisher, number, sent_ns, stamp, views[0].dtype.str, shapes)
+        dtype, period_ns = views[0].dtype.str, message.stamp.period_ns
+        header = Header(publisher, number, sent_ns, stamp, period_ns, dtype, shapes)
         payload = b"".join(view.data for view in views)
     else:
         header = Header(publisher, number, sent_ns)
@@ -158,7 +163,9 @@ def _decode_raw(packet: Packet, kind: type[Any], header: Header) -> Any:
     data = np.frombuffer(bytes(packet.payload), dtype)
     left, right = np.split(data, [sizes[0]])
     return kind(
-        Stamp(*header.stamp), left.reshape(header.shapes[0]), right.reshape(header.shapes[1])
+        Stamp(*header.stamp, header.period_ns),
+        left.reshape(header.shapes[0]),
+        right.reshape(header.shapes[1]),
     )
 
 
@@ -214,8 +221,30 @@ def _scale_truth(truth: Truth, factor: float) -> Truth:
 def _scale_seed(seed: Seed, factor: float) -> Seed:
     if seed.point is None:
         return seed
-    x, y, z = seed.point
-    return dataclasses.replace(seed, point=(x * factor, y * factor, z * factor))
+    return dataclasses.replace(seed, point=_scale_point(seed.point, factor))
+
+
+def _scale_grasp_request(request: GraspRequest, factor: float) -> GraspRequest:
+    where = request.where
+    lengths = {
+        name: None if value is None else value * factor
+        for name, value in (("from_start", where.from_start), ("from_end", where.from_end))
+    }
+    near = None if where.near is None else _scale_point(where.near, factor)
+    return dataclasses.replace(request, where=dataclasses.replace(where, near=near, **lengths))
+
+
+def _scale_grasp(grasp: Grasp, factor: float) -> Grasp:
+    return dataclasses.replace(
+        grasp, position=grasp.position * factor, sigma=grasp.sigma * factor
+    )
+
+
+def _scale_point(
+    point: tuple[float, float, float], factor: float
+) -> tuple[float, float, float]:
+    x, y, z = point
+    return x * factor, y * factor, z * factor
 
 
 _SCALE: dict[type[Any], Callable[[Any, float], Any]] = {
@@ -223,4 +252,6 @@ _SCALE: dict[type[Any], Callable[[Any, float], Any]] = {
     ThreadState: _scale_state,
     Truth: _scale_truth,
     Seed: _scale_seed,
+    GraspRequest: _scale_grasp_request,
+    Grasp: _scale_grasp,
 }

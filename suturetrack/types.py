@@ -34,6 +34,9 @@ class Stamp:
     released_ns: int
     """Wall clock when the source let the frame go, in ns: equal to `capture_ns` for live input.
     Latencies are counted from here."""
+    period_ns: int = 0
+    """Time until the source lets the next frame go, in ns; 0 where nothing is promised: in lock-step
+    and in recordings."""
 
 
 @dataclass(frozen=True, eq=False)

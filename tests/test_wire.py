@@ -30,7 +30,7 @@ from suturetrack.types import (
     Truth,
 )
 
-STAMP = Stamp(7, 233_333_333, 1_700_000_000_000_000_000)
+STAMP = Stamp(7, 233_333_333, 1_700_000_000_000_000_000, 33_333_333)
 RNG = np.random.default_rng(3)
 
 
@@ -79,6 +79,10 @@ MESSAGES: list[Any] = [
     SeedReply("0", True, "found 175 mm", STAMP, curve()),
     SeedReply("0", False, "no ridge there", candidates=((1.0, 2.0), (3.0, 4.0))),
     Grasp(STAMP, "0", np.ones(3), np.eye(3), 1e-4),
+    GraspRequest("0", GraspPoint(from_end=0.01)),
+    GraspRequest("a", GraspPoint(near=(0.1, 0.2, 0.3)), (1.0, 0.0, 0.0)),
+    GraspReply("0", Grasp(STAMP, "0", np.ones(3), np.eye(3), 1e-4)),
+    GraspReply("0", None, "thread '0' is lost"),
     Truth(STAMP, "0", RNG.normal(size=(9, 3)), 0.2, np.ones(9, bool)),
     STAMP,
     HEALTH,
@@ -134,6 +138,7 @@ def test_images_travel_as_raw_pixels_that_any_language_can_read() -> None:
     header = msgspec.msgpack.decode(packet.attachment)
     assert header["shapes"] == [[48, 64, 3], [48, 64, 3]]
     assert header["stamp"] == [STAMP.frame, STAMP.capture_ns, STAMP.released_ns]
+    assert header["period_ns"] == STAMP.period_ns
 
 
 def test_views_that_are_not_contiguous_are_sent_right() -> None:
