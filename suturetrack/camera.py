@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -26,6 +26,8 @@ class Camera:
     """(3, 3) rotation from the camera's own axes to the rectified axes."""
     projection: Float64
     """(3, 4) from the rectified left frame to rectified pixels."""
+    fisheye: bool = False
+    """Whether `distortion` holds the four coefficients of the equidistant model (`cv2.fisheye`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,22 +50,26 @@ class StereoRig:
         rotation: Float64,
         translation: Float64,
         metres_per_unit: float,
+        *,
+        fisheye: bool = False,
     ) -> StereoRig:
         """The rig for `(K, D)` of both cameras and the pose `right_from_left` (OpenCV's R and T).
 
         Images that are rectified already (no distortion, no rotation, T along x, one focal length)
-        are left alone; others get `cv2.stereoRectify` with `CALIB_ZERO_DISPARITY`.
+        are left alone; others get `cv2.stereoRectify` with `CALIB_ZERO_DISPARITY`, or its
+        namesake in `cv2.fisheye` where the distortion is equidistant.
 
         Raises:
             InputError: the right camera stands left of, above or below the left one.
         """
-        if _is_rectified(left, right, rotation, translation):
+        if not fisheye and _is_rectified(left, right, rotation, translation):
             rotations = np.eye(3), np.eye(3)
             baseline = -float(translation[0])
             shift = np.array([[0, 0, 0, -left[0][0, 0] * baseline], [0, 0, 0, 0], [0, 0, 0, 0]])
             projections = np.c_[left[0], np.zeros(3)], np.c_[right[0], np.zeros(3)] + shift
         else:
-            r1, r2, p1, p2, *_ = cv2.stereoRectify(
+            stereo_rectify = cv2.fisheye.stereoRectify if fisheye else cv2.stereoRectify
+            r1, r2, p1, p2, *_ = stereo_rectify(
                 *left,
                 *right,
                 image_size,
@@ -80,10 +86,35 @@ class StereoRig:
                 "swap left and right, or give T as right_from_left"
             )
         cameras = [
-            Camera(np.asarray(k, float), np.asarray(d, float), r, p)
+            Camera(np.asarray(k, float), np.asarray(d, float), r, p, fisheye)
             for (k, d), r, p in zip((left, right), rotations, projections, strict=True)
         ]
         return cls(image_size, cameras[0], cameras[1], metres_per_unit)
+
+    def for_rectified_images(self) -> StereoRig:
+        """The same rig for images that somebody has rectified already, with these projections."""
+        left, right = (
+            Camera(c.projection[:, :3], np.zeros(5), np.eye(3), c.projection)
+            for c in (self.left, self.right)
+        )
+        return replace(self, left=left, right=right)
+
+    def resized(self, factor: float) -> StereoRig:
+        """The same rig for images that are `factor` times as wide and high; frames stay as they are."""
+        shift = (factor - 1) / 2  # the centre of the corner pixel moves in the corner pixel
+        change = np.array([[factor, 0, shift], [0, factor, shift], [0, 0, 1]])
+        left, right = (
+            replace(c, matrix=change @ c.matrix, projection=change @ c.projection)
+            for c in (self.left, self.right)
+        )
+        width, height = (round(side * factor) for side in self.image_size)
+        return replace(self, image_size=(width, height), left=left, right=right)
+
+    @property
+    def right_from_left(self) -> tuple[Float64, Float64]:
+        """R and T between the cameras' own axes, as OpenCV has them; T in the calibration's unit."""
+        rotation = self.right.rectification.T @ self.left.rectification
+        return rotation, self.right.rectification.T @ np.array([-self.baseline, 0.0, 0.0])
 
     @property
     def focal(self) -> float:
@@ -99,7 +130,9 @@ class StereoRig:
     def is_rectified(self) -> bool:
         """Whether raw pixels are rectified pixels."""
         return all(
-            np.array_equal(c.rectification, np.eye(3)) and not c.distortion.any()
+            np.array_equal(c.rectification, np.eye(3))
+            and np.array_equal(c.matrix, c.projection[:, :3])
+            and not c.distortion.any()
             for c in (self.left, self.right)
         )
 
@@ -138,7 +171,8 @@ class StereoRig:
             return np.asarray(pixels, float)
         camera = self.right if right else self.left
         flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
-        rectified = cv2.undistortPoints(
+        undistort = cv2.fisheye.undistortPoints if camera.fisheye else cv2.undistortPoints
+        rectified = undistort(
             flat, camera.matrix, camera.distortion, R=camera.rectification, P=camera.projection
         )
         return rectified.reshape(np.shape(pixels))
@@ -171,7 +205,7 @@ class StereoRig:
     @cached_property
     def _maps(self) -> list[tuple[Image, Image]]:
         return [
-            cv2.initUndistortRectifyMap(
+            (cv2.fisheye if c.fisheye else cv2).initUndistortRectifyMap(
                 c.matrix, c.distortion, c.rectification, c.projection, self.image_size, cv2.CV_16SC2
             )
             for c in (self.left, self.right)
@@ -213,5 +247,6 @@ def _distort(camera: Camera, pixels: Float64) -> Float64:
         [(pixels - p[:2, 2]) / p[[0, 1], [0, 1]], np.ones_like(pixels[..., :1])], -1
     )
     flat = (rays @ camera.rectification).reshape(-1, 1, 3)
-    raw, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
+    project = cv2.fisheye.projectPoints if camera.fisheye else cv2.projectPoints
+    raw, _ = project(flat, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
     return raw.reshape(pixels.shape)

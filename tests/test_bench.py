@@ -22,7 +22,7 @@ from suturetrack.types import Energies, InputError, Nurbs, Stamp, Status, Thread
 from tests.conftest import make_rig
 
 STAMP = Stamp(0, 0, 0)
-CASE = Case("figure8-175", "bench", 1, "paper")
+CASE = Case("figure8-175", 1, methods=("paper",))
 GOOD = FrameScore(
     status=Status.TRACKING,
     energy=-0.9,
@@ -96,7 +96,7 @@ def test_every_frame_counts_and_wrong_ones_are_false_only_while_called_tracking(
     scores = (
         [GOOD] * 5 + [LOST] * 3 + [GOOD] * 4 + [WRONG] * 2 + [replace(WRONG, status=Status.LOST)]
     )
-    row = summarise(CASE, "0", scores, fps=30.0)
+    row = summarise(CASE, "paper", "0", scores)
     assert row.frames == 15
     assert row.tracked_percent == pytest.approx(100 * 11 / 15)
     assert row.false_percent == pytest.approx(100 * 2 / 15)
@@ -108,12 +108,12 @@ def test_every_frame_counts_and_wrong_ones_are_false_only_while_called_tracking(
 
 
 def test_a_thread_that_was_never_found_is_a_loss() -> None:
-    row = summarise(CASE, "0", [replace(LOST, rms=math.nan, p95=math.nan)] * 4, fps=30.0)
+    row = summarise(CASE, "paper", "0", [replace(LOST, rms=math.nan, p95=math.nan)] * 4)
     assert (row.tracked_percent, row.false_percent, row.losses) == (0, 0, 1)
 
 
 def test_the_time_to_recover_is_that_of_the_longest_loss() -> None:
-    row = summarise(CASE, "0", [GOOD] + [LOST] * 3 + [GOOD] + [LOST] * 6 + [GOOD], fps=30.0)
+    row = summarise(CASE, "paper", "0", [GOOD] + [LOST] * 3 + [GOOD] + [LOST] * 6 + [GOOD])
     assert (row.losses, row.longest_recovery_s) == (2, pytest.approx(0.2))
 
 
@@ -157,7 +157,7 @@ def test_a_folder_without_pairs_is_refused(tmp_path: Path) -> None:
 
 
 def test_rows_are_printed_and_written_whole(tmp_path: Path) -> None:
-    rows = [summarise(CASE, str(i), [GOOD] * 3, 30.0) for i in range(30)]
+    rows = [summarise(CASE, "paper", str(i), [GOOD] * 3) for i in range(30)]
     console = Console(width=400, record=True)
     report.print_rows(console, "Tracking", rows)
     assert console.export_text().count("figure8-175") == 30

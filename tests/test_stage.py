@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -194,7 +196,7 @@ def test_pictures_follow_their_settings() -> None:
 
 
 def test_size_and_rate_change_the_sampling_not_the_scene(scene: Scene) -> None:
-    large = open_scene("figure8-175", seed=2, size=(1280, 720), fps=60.0)
+    large = open_scene("figure8-175", seed=2, fps=60.0, picture=Picture(size=(1280, 720)))
     assert large.render(20)[1].shape == (720, 1280, 3)
     assert large.frame_count == 1200
     assert large.rig.focal == pytest.approx(1600)
@@ -205,13 +207,24 @@ def test_miscalibrated_cameras_show_the_thread_beside_the_projection() -> None:
     look = Picture(thread="black", background="plain", shadow=0.0)
 
     def error(**settings: float) -> float:
-        scene = open_scene("figure8-107", 2, picture=look, **settings)  # type: ignore[arg-type]
+        scene = open_scene("figure8-107", 2, picture=replace(look, **settings))  # type: ignore[arg-type]
         pixels = scene.rig.project_raw(scene.truth(0)[0].points)[0]
         return float(np.abs(centre_offsets(scene.render(0)[0], pixels)[8:-8]).mean())
 
     assert error() < 0.1
     assert 0.25 < error(half_pixel=True) < 0.75
     assert 0.15 < error(calibration_error_px=1.0) < 4
+
+
+def test_distorted_lenses_show_the_thread_where_the_calibration_says() -> None:
+    look = Picture(thread="black", background="plain", shadow=0.0, distortion=-0.3)
+    scene = open_scene("figure8-107", 2, picture=look)
+    straight = open_scene("figure8-107", 2, picture=replace(look, distortion=0.0))
+    pixels = scene.rig.project_raw(scene.truth(0)[0].points)[0]
+    assert np.abs(centre_offsets(scene.render(0)[0], pixels)[8:-8]).mean() < 0.1
+    assert np.abs(centre_offsets(straight.render(0)[0], pixels)[8:-8]).max() > 1
+    with pytest.raises(InputError, match=r"distortion 3: use -0\.5 to 0\.5"):
+        open_scene("figure8-107", picture=replace(look, distortion=3))
 
 
 def test_contact_sheet_has_a_row_for_each_scenario() -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
-from multiprocessing import get_context
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context, parent_process
 from typing import Literal
 
 import cv2
@@ -19,7 +21,7 @@ from services.bench import report
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.segmentation import Segmenter
-from suturetrack.stage import SCENARIOS, open_scene
+from suturetrack.stage import SCENARIOS, Picture, open_scene
 from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.types import (
     Bool,
@@ -54,20 +56,26 @@ class TrackingBench:
     """Trackers to run side by side."""
     rig: str = "bench"
     """The rig of the scenes."""
+    fps: float = 30.0
+    """Frames a second."""
+    picture: Picture = field(default_factory=Picture)
+    """How the scenes are filmed."""
     seconds: float | None = None
     """Only so much of each scene; None for the whole."""
     workers: int = 2
-    """Runs side by side."""
+    """Scenes side by side."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One run of the tracker over one scene."""
+    """One scene, tracked by every method on the same fields."""
 
     scenario: str
-    rig: str
     seed: int
-    method: Method
+    rig: str = "bench"
+    methods: tuple[Method, ...] = ("gauss-newton",)
+    fps: float = 30.0
+    picture: Picture = field(default_factory=Picture)
     seconds: float | None = None
 
 
@@ -152,21 +160,22 @@ def rows(config: TrackingBench) -> Iterator[list[Row]]:
     for name in config.scenarios:
         if name not in known:
             raise InputError(f"no scenario {name!r}; there are {', '.join(known)}")
+    how = config.rig, config.methods, config.fps, config.picture, config.seconds
     cases = [
-        Case(name, config.rig, config.first_seed + k, method, config.seconds)
+        Case(name, config.first_seed + k, *how)
         for name in config.scenarios
         for k in range(config.seeds)
-        for method in config.methods
     ]
     # Numba and OpenCV keep threads, which do not survive a fork.
-    with ProcessPoolExecutor(config.workers, mp_context=get_context("spawn")) as pool:
+    context = get_context("spawn")
+    with ProcessPoolExecutor(config.workers, context, initializer=_end_with_parent) as pool:
         for future in as_completed([pool.submit(run_case, case) for case in cases]):
             yield future.result()
 
 
 def run(config: TrackingBench, console: Console) -> list[Row]:
     """Prints every row, the paper's Table I, and the share of false tracking over all."""
-    total = len(config.scenarios) * config.seeds * len(config.methods)
+    total = len(config.scenarios) * config.seeds
     progress = track(rows(config), "Tracking", total=total, console=console, transient=True)
     table = sorted(
         (row for case in progress for row in case),
@@ -186,32 +195,39 @@ def run(config: TrackingBench, console: Console) -> list[Row]:
 
 
 def run_case(case: Case) -> list[Row]:
-    """Tracks every thread of the scene from one seed pixel in its first frame; a row a thread."""
+    """Tracks the scene's threads from one seed pixel each in the first frame.
+
+    A row a method and thread; all methods work on the same fields.
+    """
     cv2.setNumThreads(1)
-    scene = open_scene(case.scenario, case.seed, case.rig)
+    scene = open_scene(case.scenario, case.seed, case.rig, case.fps, case.picture)
     segmenter = Segmenter(scene.rig)
-    tracker = Tracker(scene.rig, TrackingConfig(method=case.method))
+    trackers = {m: Tracker(scene.rig, TrackingConfig(method=m)) for m in case.methods}
     count = scene.frame_count
     if case.seconds is not None:
         count = min(count, round(case.seconds * scene.fps))
-    scores: dict[str, list[FrameScore]] = {name: [] for name in scene.threads}
+    runs = [(method, thread) for method in case.methods for thread in scene.threads]
+    scores: dict[tuple[Method, str], list[FrameScore]] = {run: [] for run in runs}
     limits: dict[str, float] = {}
     for i in range(count):
         frame = StereoFrame(Stamp(i, round(i * 1e9 / scene.fps), 0), *scene.render(i))
         for name in scene.threads if i == 0 else ():
             seed = Seed(name, pixel=scene.seed_pixel(0, name))
             segmenter.learn(frame, seed)
-            tracker.seed(seed)
-        field = segmenter.step(frame)
-        began = time.perf_counter()
-        states = {s.thread: s for s in tracker.step(field).states}
-        elapsed = 1000 * (time.perf_counter() - began)
-        for truth in scene.truth(i):
-            if i % _FRAMES_A_LIMIT == 0:
-                limits[truth.thread] = metrics.physical_limit(scene.rig, truth.points)
-            state, limit = states[truth.thread], limits[truth.thread]
-            scores[truth.thread].append(score(state, truth, scene.rig, limit, elapsed))
-    return [summarise(case, name, scores[name], scene.fps) for name in scene.threads]
+            for tracker in trackers.values():
+                tracker.seed(seed)
+        seen = segmenter.step(frame)
+        truths = {truth.thread: truth for truth in scene.truth(i)}
+        if i % _FRAMES_A_LIMIT == 0:
+            limits = {t: metrics.physical_limit(scene.rig, truths[t].points) for t in truths}
+        for method, tracker in trackers.items():
+            began = time.perf_counter()
+            states = {state.thread: state for state in tracker.step(seen).states}
+            elapsed = 1000 * (time.perf_counter() - began)
+            for name, truth in truths.items():
+                result = score(states[name], truth, scene.rig, limits[name], elapsed)
+                scores[method, name].append(result)
+    return [summarise(case, *run, scores[run]) for run in runs]
 
 
 def score(
@@ -261,8 +277,8 @@ def score(
     )
 
 
-def summarise(case: Case, thread: str, scores: list[FrameScore], fps: float) -> Row:
-    """The row of one thread: every frame since the seed counts, errors over the tracked ones."""
+def summarise(case: Case, method: Method, thread: str, scores: list[FrameScore]) -> Row:
+    """The row of one method and thread: every frame since the seed counts, errors over the tracked ones."""
     tracking = np.array([s.status == Status.TRACKING for s in scores], dtype=bool)
     p95 = _column(scores, "p95")
     wrong = tracking & ~(p95 <= FALSE_BEYOND_MM)
@@ -272,12 +288,12 @@ def summarise(case: Case, thread: str, scores: list[FrameScore], fps: float) -> 
     error = (length - true_length)[whole]
     ends = np.array([s.ends for s in scores], dtype=float)[whole]
     rms = _column(scores, "rms")[tracking]
-    losses, longest = _losses(tracking, fps)
+    losses, longest = _losses(tracking, case.fps)
     return Row(
         scenario=case.scenario,
         rig=case.rig,
         seed=case.seed,
-        method=case.method,
+        method=method,
         thread=thread,
         frames=len(scores),
         tracked_percent=100 * float(tracking.mean()),
@@ -300,6 +316,18 @@ def summarise(case: Case, thread: str, scores: list[FrameScore], fps: float) -> 
         energy=_mean(_column(scores, "energy")[tracking]),
         update_ms=_percentile(_column(scores, "milliseconds"), 50),
     )
+
+
+def _end_with_parent() -> None:
+    """Ends this worker as soon as the benchmark that started it is gone."""
+    parent = parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _losses(tracking: Bool, fps: float) -> tuple[int, float]:

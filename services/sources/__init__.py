@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +13,7 @@ from services.sources.stage import StageFootage
 from services.sources.video import VideoFootage
 from suturetrack.calibration import load_calibration
 from suturetrack.camera import StereoRig
+from suturetrack.stage import Picture
 from suturetrack.types import InputError
 
 STAGE = "stage:"
@@ -37,6 +38,8 @@ class InputConfig:
     """Which variant of the bench top's scene."""
     scene_rig: str = "bench"
     """Which rig looks at the bench top: bench or endoscope."""
+    picture: Picture = field(default_factory=Picture)
+    """How the bench top is filmed."""
 
 
 def open_input(config: InputConfig) -> tuple[Footage, StereoRig]:
@@ -67,7 +70,7 @@ def open_input(config: InputConfig) -> tuple[Footage, StereoRig]:
 
 def _open_stage(config: InputConfig) -> tuple[Footage, StereoRig]:
     name = config.source.removeprefix(STAGE)
-    stage = StageFootage(name, config.scene_seed, config.scene_rig, config.fps)
+    stage = StageFootage(name, config.scene_seed, config.scene_rig, config.fps, config.picture)
     if config.calibration is None:
         return stage, stage.rig
     rig = load_calibration(config.calibration, config.unit)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from services.sources.footage import Exposure
-from suturetrack.stage import open_scene
+from suturetrack.stage import Picture, open_scene
 
 
 class StageFootage:
@@ -11,8 +11,8 @@ class StageFootage:
 
     live = False
 
-    def __init__(self, name: str, seed: int, rig: str, fps: float):
-        self._scene = open_scene(name, seed, rig, fps=fps)
+    def __init__(self, name: str, seed: int, rig: str, fps: float, picture: Picture):
+        self._scene = open_scene(name, seed, rig, fps, picture)
         self.rig = self._scene.rig
         self.size = self.rig.image_size
         self.fps = fps

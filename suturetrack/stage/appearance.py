@@ -13,7 +13,7 @@ from suturetrack.types import Float32, Float64, Image
 
 @dataclass(frozen=True)
 class Picture:
-    """How the images look; what is None is chosen by the scenario and the seed."""
+    """How the images are taken and look; what is None is chosen by the scenario and the seed."""
 
     thread: str | None = None
     """Colour of every thread, a name in `COLOURS`."""
@@ -35,6 +35,14 @@ class Picture:
     """How far exposure and white balance swing, as a share."""
     jpeg: int | None = None
     """Quality of JPEG compression, 1 to 100; None for none."""
+    size: tuple[int, int] = (640, 480)
+    """Width and height, px."""
+    distortion: float = 0.0
+    """Radial distortion k1 of both lenses, below 0 for barrels; 0 gives rectified images."""
+    calibration_error_px: float = 0.0
+    """How far the real cameras are off their calibration, about, px."""
+    half_pixel: bool = False
+    """Whether the real cameras count pixels from corners, not from centres."""
 
 
 @dataclass(frozen=True)

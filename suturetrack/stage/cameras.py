@@ -31,8 +31,10 @@ _LARGEST_TILT = np.radians(18.0)
 _ROLLS = np.radians(np.r_[0.0, np.repeat(np.arange(10.0, 181.0, 10.0), 2)])
 
 
-def make_rig(name: str, size: tuple[int, int]) -> StereoRig:
-    """The rectified rig with that name, for images of `size` (width, height), in mm.
+def make_rig(name: str, size: tuple[int, int], distortion: float = 0.0) -> StereoRig:
+    """The rig with that name, for images of `size` (width, height), in mm.
+
+    `distortion` is the coefficient k1 of both lenses; without it the images are rectified already.
 
     Raises:
         InputError: there is no such rig.
@@ -42,8 +44,8 @@ def make_rig(name: str, size: tuple[int, int]) -> StereoRig:
     model, (width, height) = RIGS[name], size
     focal = model.focal_px * width / 640
     matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-    none, shift = np.zeros(5), np.array([-model.baseline, 0.0, 0.0])
-    return StereoRig.from_calibration(size, (matrix, none), (matrix, none), np.eye(3), shift, 1e-3)
+    lens, shift = np.array([distortion, 0, 0, 0, 0]), np.array([-model.baseline, 0.0, 0.0])
+    return StereoRig.from_calibration(size, (matrix, lens), (matrix, lens), np.eye(3), shift, 1e-3)
 
 
 def misalign(
@@ -56,11 +58,10 @@ def misalign(
     for camera in (rig.left, rig.right):
         focal = camera.projection[0, 0]
         turn = Rotation.from_rotvec(rng.normal(0, error_px / focal / np.sqrt(2), 3))
-        change = np.diag([1 + rng.normal(0, error_px / focal)] * 2 + [1.0])
-        change[:2, 2] = 0.5 * half_pixel
-        matrix = camera.projection[:, :3]
-        homography = change @ matrix @ turn.as_matrix() @ np.linalg.inv(matrix)
-        cameras.append(replace(camera, projection=homography @ camera.projection))
+        matrix = camera.matrix * (1 + rng.normal(0, error_px / focal) * np.diag([1, 1, 0]))
+        matrix[:2, 2] += 0.5 * half_pixel
+        rectification = camera.rectification @ turn.as_matrix().T
+        cameras.append(replace(camera, matrix=matrix, rectification=rectification))
     return replace(rig, left=cameras[0], right=cameras[1])
 
 

@@ -37,11 +37,8 @@ def open_scene(
     name: str,
     seed: int = 0,
     rig: str = "bench",
-    size: tuple[int, int] = (640, 480),
     fps: float = 30.0,
     picture: Picture = DEFAULT_PICTURE,
-    calibration_error_px: float = 0.0,
-    half_pixel: bool = False,
 ) -> Scene:
     """The scenario `name`, varied by `seed`, seen by the rig with that name.
 
@@ -49,11 +46,8 @@ def open_scene(
         name: one of `SCENARIOS`.
         seed: a number from 0 up; every one gives another shape, viewpoint, timing and look.
         rig: one of `RIGS`.
-        size: width and height of the images, px.
         fps: frames a second.
-        picture: how the images look.
-        calibration_error_px: how far the real cameras are off their calibration, about, px.
-        half_pixel: whether the real cameras count pixels from corners, not from centres.
+        picture: how the images are taken and look.
 
     Raises:
         InputError: there is no such scenario, rig, colour or background, or a number is impossible.
@@ -62,18 +56,19 @@ def open_scene(
         raise InputError(f"no scenario {name!r}; use one of {', '.join(SCENARIOS)}")
     if seed < 0:
         raise InputError(f"seed {seed} of the scene: use a whole number from 0 up")
-    if min(size) < 64 or fps <= 0:
-        raise InputError(
-            f"images of {size[0]}x{size[1]} at {fps} fps: use 64x64 or more, above 0 fps"
-        )
+    if min(picture.size) < 64 or fps <= 0:
+        width, height = picture.size
+        raise InputError(f"images of {width}x{height} at {fps} fps: use 64x64 or more, above 0 fps")
+    if not -0.5 <= picture.distortion <= 0.5:
+        raise InputError(f"distortion {picture.distortion}: use -0.5 to 0.5")
     for what, known in ((picture.thread, COLOURS), (picture.background, TEXTURES)):
         if what is not None and what not in known:
             raise InputError(f"no look {what!r}; use one of {', '.join(known)}")
-    told = make_rig(rig, size)
+    told = make_rig(rig, picture.size, picture.distortion)
     rng = np.random.default_rng([seed, 1])
     real = told
-    if calibration_error_px or half_pixel:
-        real = misalign(told, rng, calibration_error_px, half_pixel)
+    if picture.calibration_error_px or picture.half_pixel:
+        real = misalign(told, rng, picture.calibration_error_px, picture.half_pixel)
     return Scene(SCENARIOS[name], seed, told, real, RIGS[rig].distances, fps, picture)
 
 
