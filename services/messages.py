@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from suturetrack.types import Nurbs, Stamp
+from suturetrack.grasping import AWAY_FROM_CAMERA, GraspPoint
+from suturetrack.types import Grasp, Nurbs, Stamp
 
 
 @dataclass(frozen=True)
@@ -59,3 +60,25 @@ class SeedReply:
     """The first curve, in metres; None when refused."""
     candidates: tuple[tuple[float, float], ...] = ()
     """When refused: the pixels (u, v) of the raw left image nearest to the seed that look like thread."""
+
+
+@dataclass(frozen=True)
+class GraspRequest:
+    """Where a gripper would like to take a thread, and from which side."""
+
+    thread: str
+    where: GraspPoint
+    """In metres."""
+    approach: tuple[float, float, float] = AWAY_FROM_CAMERA
+    """Direction in which the gripper moves in, rectified left frame; any length."""
+
+
+@dataclass(frozen=True)
+class GraspReply:
+    """The pose at which to take a thread, or why it should not be taken."""
+
+    thread: str
+    grasp: Grasp | None
+    """In metres; None when refused."""
+    reason: str = ""
+    """Why it was refused, in words."""

@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, TypeVar
 
-from services.messages import Health, SeedReply
+from services.messages import GraspReply, GraspRequest, Health, SeedReply
 from suturetrack.camera import StereoRig
 from suturetrack.types import RidgeField, Seed, Stamp, StereoFrame, ThreadState, Truth
 
@@ -64,7 +64,10 @@ CALIBRATION: Question[None, StereoRig] = Question(
 SEED: Question[Seed, SeedReply] = Question(
     "thread/{thread}/seed", Seed, SeedReply, "tracker", "find the thread from here"
 )
-QUESTIONS: tuple[Question[Any, Any], ...] = (CALIBRATION, SEED)
+GRASP: Question[GraspRequest, GraspReply] = Question(
+    "thread/{thread}/grasp", GraspRequest, GraspReply, "tracker", "where to take the thread"
+)
+QUESTIONS: tuple[Question[Any, Any], ...] = (CALIBRATION, SEED, GRASP)
 
 
 def root(rig: str) -> str:

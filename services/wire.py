@@ -235,14 +235,10 @@ def _scale_grasp_request(request: GraspRequest, factor: float) -> GraspRequest:
 
 
 def _scale_grasp(grasp: Grasp, factor: float) -> Grasp:
-    return dataclasses.replace(
-        grasp, position=grasp.position * factor, sigma=grasp.sigma * factor
-    )
+    return dataclasses.replace(grasp, position=grasp.position * factor, sigma=grasp.sigma * factor)
 
 
-def _scale_point(
-    point: tuple[float, float, float], factor: float
-) -> tuple[float, float, float]:
+def _scale_point(point: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
     x, y, z = point
     return x * factor, y * factor, z * factor
 

@@ -95,7 +95,9 @@ def _distance(where: GraspPoint, length: float) -> float:
     distance = where.from_start if where.from_start is not None else where.from_end
     assert distance is not None
     if not 0 <= distance <= length:
-        raise InputError(f"grasp: {distance:.6g} lies off the thread, which is {length:.6g} long")
+        raise InputError(
+            f"grasp: the place lies off the thread, at {100 * distance / length:.4g} % of its length"
+        )
     return distance if where.from_start is not None else length - distance
 
 

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from services import topics, wire
-from services.messages import Health, Latency, SeedReply
+from services.messages import GraspReply, GraspRequest, Health, Latency, SeedReply
 from services.wire import Packet, WireError
 from suturetrack.camera import StereoRig
+from suturetrack.grasping import GraspPoint
 from suturetrack.types import (
     Energies,
     Grasp,
@@ -263,6 +264,13 @@ def with_points(value: float) -> Nurbs:
         Seed("0", pixel=(math.nan, 2)),
         Seed("0", point=(1, 2, math.inf)),
         Grasp(STAMP, "0", np.ones(3), 2 * np.eye(3), 0.1),
+        GraspRequest("0", GraspPoint()),
+        GraspRequest("0", GraspPoint(from_start=0.1, fraction=0.5)),
+        GraspRequest("0", GraspPoint(from_end=math.nan)),
+        GraspRequest("0", GraspPoint(fraction=0.5), (0.0, 0.0, 0.0)),
+        GraspRequest("0", GraspPoint(fraction=0.5), (0.0, math.nan, 1.0)),
+        GraspReply("0", None),
+        GraspReply("0", Grasp(STAMP, "0", np.full(3, np.inf), np.eye(3), 0.1)),
         Truth(STAMP, "0", np.ones((4, 3)), 0.2, np.ones(5, bool)),
         dataclasses.replace(rig(), metres_per_unit=0.0),
         dataclasses.replace(rig(), metres_per_unit=math.nan),
