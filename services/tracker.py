@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 
 from services import topics
+from services.grasping import GraspDesk
 from services.seeding import SeedDesk
 from services.service import Service, ServiceConfig, Stopped
 from services.wire import scaled
@@ -38,6 +39,7 @@ def run(service: Service, config: TrackerConfig) -> None:
     rig = service.calibrated_rig()
     tracker = Tracker(rig, config.tracking, config.initialization)
     desk = SeedDesk(bus, tracker, rig, config.tracking.patience)
+    grasps = GraspDesk(bus, rig)
     for i, pixel in enumerate(config.seed):
         desk.seed(Seed(str(i), pixel=pixel))
     _warm_up(rig, config)
@@ -51,6 +53,7 @@ def run(service: Service, config: TrackerConfig) -> None:
         step = tracker.step(ridges)
         for state in step.states:
             bus.publish(topics.STATE, scaled(state, rig.metres_per_unit))
+        grasps.update(step.states)
         bus.publish(topics.STEP, ridges.stamp)
         published_ns = service.finished(ridges.stamp)
         recorder.states(step.states, published_ns)
