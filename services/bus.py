@@ -10,7 +10,7 @@ import threading
 import time
 import uuid
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, Protocol, TypeVar
 
 from services import topics, wire
@@ -25,6 +25,7 @@ A = TypeVar("A")
 DEPTH = 1024
 """Messages that wait for a reader of every one before the oldest is given up, and counted."""
 _MOST_PUBLISHERS = 256
+_MOST_KEPT = 256
 _POLL_S = 0.02
 
 Deliver = Callable[[str, Packet], None]
@@ -47,6 +48,12 @@ class Transport(Protocol):
 
     def subscribe(self, pattern: str, deliver: Deliver) -> None:
         """Calls `deliver(key, packet)` from another thread for every packet that arrives."""
+
+    def remember(self, pattern: str, kept: Mapping[str, Packet]) -> None:
+        """Gives others who ask for `last` what is in `kept`, by key, at that time."""
+
+    def last(self, pattern: str, timeout: float) -> list[tuple[str, Packet]]:
+        """What those who remember give, at once when nobody does."""
 
     def has_readers(self, key: str) -> bool:
         """Whether somebody subscribes to the key."""
@@ -156,10 +163,12 @@ class Bus:
         complain: Callable[[str], None] = lambda _: None,
     ):
         self.stop = Stop()
+        self.rig = rig
         self.process = process
         self.complain = complain
         self.readers: list[Reader[Any]] = []
         self.refused_questions = 0
+        self.refused_kept = 0
         self._transport = transport
         self._root = topics.root(rig)
         self._publisher = f"{process}-{uuid.uuid4().hex[:8]}"
@@ -174,7 +183,8 @@ class Bus:
     @property
     def refused(self) -> int:
         """Bad messages and questions so far."""
-        return self.refused_questions + sum(reader.refused for reader in self.readers)
+        refused = self.refused_questions + self.refused_kept
+        return refused + sum(reader.refused for reader in self.readers)
 
     def publish(self, topic: Topic[T], message: T) -> None:
         """Sends a message to everyone who reads the topic now; waits for nobody."""
@@ -195,6 +205,41 @@ class Bus:
     def every(self, topic: Topic[T]) -> Reader[T]:
         """Reads every message in order."""
         return self._read(topic, DEPTH)
+
+    def keep(self, topic: Topic[T], worth: Callable[[T], bool] = lambda _: True) -> None:
+        """Remembers the last message of every key that is worth it, for others to have by `last`.
+
+        The first one is always worth it.
+        """
+        pattern = f"{self._root}/{topics.pattern_of(topic)}"
+        kept: dict[str, Packet] = {}
+
+        def deliver(key: str, packet: Packet) -> None:
+            try:
+                message = self.open(topic, key, packet)
+            except WireError as error:
+                self.refused_kept += 1
+                self.complain(f"refused a message: {key}: {error}")
+                return
+            if key in kept:
+                if worth(message):
+                    kept[key] = packet
+            elif len(kept) < _MOST_KEPT:
+                kept[key] = packet
+
+        self._transport.subscribe(pattern, deliver)
+        self._transport.remember(pattern, kept)
+
+    def last(self, topic: Topic[T], timeout: float = 1.0) -> list[T]:
+        """The last message of every key, as its keeper remembers it."""
+        pattern = f"{self._root}/{topics.pattern_of(topic)}"
+        found = []
+        for key, packet in self._transport.last(pattern, timeout):
+            try:
+                found.append(self.open(topic, key, packet))
+            except WireError as error:
+                self.complain(f"refused what was remembered: {key}: {error}")
+        return found
 
     def wait_for_readers(self, topic: Topic[Any], timeout: float | None = None) -> bool:
         """Waits until somebody reads the topic; False after the time-out or when stopped."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from services.bus import Deliver, NoAnswer, Reply
 from services.wire import Packet
@@ -34,6 +34,7 @@ class MemoryTransport:
         self._hub = hub
         self.subscriptions: list[tuple[str, Deliver]] = []
         self.services: list[tuple[str, Callable[[str, Packet, Reply], None]]] = []
+        self.remembered: list[tuple[str, Mapping[str, Packet]]] = []
         self.watchers: list[tuple[str, Changed]] = []
         self.alive: list[str] = []
 
@@ -51,6 +52,16 @@ class MemoryTransport:
     def subscribe(self, pattern: str, deliver: Deliver) -> None:
         """See `Transport`."""
         self.subscriptions.append((pattern, deliver))
+
+    def remember(self, pattern: str, kept: Mapping[str, Packet]) -> None:
+        """See `Transport`."""
+        self.remembered.append((pattern, kept))
+
+    def last(self, pattern: str, timeout: float) -> list[tuple[str, Packet]]:
+        """See `Transport`."""
+        del timeout
+        kept = [k for t in self._others() for p, k in t.remembered if p == pattern]
+        return [item for mapping in kept for item in mapping.items()]
 
     def has_readers(self, key: str) -> bool:
         """See `Transport`."""

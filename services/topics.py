@@ -29,6 +29,9 @@ class Topic(Generic[T]):
     keep: Literal["newest", "every"]
     """What a reader gets in real time: the newest message, or every one in order."""
     purpose: str
+    keeper: str = ""
+    """Name of the process that remembers the last message of every key, for those who come late, and
+    for the publisher when it has died and was started again; nobody does without a name."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,9 @@ class Question(Generic[Q, A]):
 
 FRAME = Topic("frame", StereoFrame, "source", "newest", "both raw images")
 FIELD = Topic("field", RidgeField, "segmenter", "newest", "both rectified ridge fields")
-STATE = Topic("thread/{thread}/state", ThreadState, "tracker", "every", "the curve and its worth")
+STATE = Topic(
+    "thread/{thread}/state", ThreadState, "tracker", "every", "the curve and its worth", "source"
+)
 TRUTH = Topic("thread/{thread}/truth", Truth, "source", "every", "where a synthetic thread is")
 SEEDING = Topic(
     "thread/{thread}/seeding",
@@ -53,8 +58,9 @@ SEEDING = Topic(
     "tracker",
     "every",
     "the seed from which a thread is looked for",
+    "source",
 )
-STEP = Topic("step", Stamp, "tracker", "every", "the tracker is done with this frame")
+STEP = Topic("step", Stamp, "tracker", "every", "the tracker is done with this frame", "segmenter")
 HEALTH = Topic("health/{process}", Health, "*", "every", "heartbeat, once a second")
 TOPICS: tuple[Topic[Any], ...] = (FRAME, FIELD, STATE, TRUTH, SEEDING, STEP, HEALTH)
 

@@ -13,7 +13,7 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -170,6 +170,22 @@ class ZenohTransport:
 
         self._kept.append(self._session.declare_subscriber(pattern, arrived))
 
+    def remember(self, pattern: str, kept: Mapping[str, Packet]) -> None:
+        """See `Transport`."""
+
+        def arrived(query: zenoh.Query) -> None:
+            with query:
+                for key, packet in list(kept.items()):
+                    if query.key_expr.intersects(zenoh.KeyExpr(key)):
+                        _reply(query, key, packet)
+
+        self._kept.append(self._session.declare_queryable(pattern, arrived))
+
+    def last(self, pattern: str, timeout: float) -> list[tuple[str, Packet]]:
+        """See `Transport`."""
+        replies = self._session.get(pattern, timeout=timeout)
+        return [(str(r.ok.key_expr), _packet(r.ok)) for r in replies if r.ok is not None]
+
     def has_readers(self, key: str) -> bool:
         """See `Transport`."""
         status: Any = self._publisher(key, large=True).matching_status  # its stub says bool
@@ -186,12 +202,7 @@ class ZenohTransport:
                     if isinstance(answer, str):
                         query.reply_err(answer)
                     else:
-                        query.reply(
-                            key,
-                            answer.payload,
-                            encoding=answer.encoding,
-                            attachment=answer.attachment,
-                        )
+                        _reply(query, key, answer)
 
             deliver(key, _packet(query), reply)
 
@@ -291,6 +302,11 @@ class ArrivedPayload:
         if shared is not None and not shared.is_valid():
             raise WireError("it was read too late: its shared memory had been taken back")
         return data
+
+
+def _reply(query: zenoh.Query, key: str, packet: Packet) -> None:
+    payload = bytes(packet.payload)
+    query.reply(key, payload, encoding=packet.encoding, attachment=packet.attachment)
 
 
 def _packet(message: zenoh.Sample | zenoh.Query) -> Packet:

@@ -215,6 +215,38 @@ def test_gaps_in_the_numbers_are_lost_messages(connect: Connect) -> None:
     assert (reader.lost, reader.passed_over) == (2, 0)
 
 
+def test_the_last_messages_outlive_their_sender(connect: Connect) -> None:
+    source, tracker = connect("source"), connect("tracker")
+    source.keep(topics.SEEDING, lambda seed: seed.pixel != (9.0, 9.0))
+    assert tracker.wait_for_readers(topics.SEEDING, 10)
+    for thread, u in (("a", 1.0), ("b", 9.0), ("a", 2.0), ("b", 3.0), ("b", 9.0)):
+        tracker.publish(topics.SEEDING, Seed(thread, pixel=(u, u)))
+    put(tracker, "thread/c/seeding", Packet("application/msgpack;seed/1", b"\xff", b"\x80"))
+    until(lambda: source.refused == 1)
+    tracker.close()
+    console = connect("console")
+    found = list[Seed]()
+
+    def asked() -> bool:
+        found[:] = console.last(topics.SEEDING)
+        return bool(found)
+
+    until(asked)
+    assert {seed.thread: seed.pixel for seed in found} == {"a": (2.0, 2.0), "b": (3.0, 3.0)}
+    assert console.last(topics.STEP) == []
+
+
+def test_what_is_remembered_is_bounded(connect: Connect) -> None:
+    source, tracker = connect("source"), connect("tracker")
+    source.keep(topics.SEEDING)
+    reader = source.every(topics.SEEDING)
+    assert tracker.wait_for_readers(topics.SEEDING, 10)
+    for i in range(300):
+        tracker.publish(topics.SEEDING, Seed(f"t{i}", pixel=(1.0, 1.0)))
+    assert all(reader.get(10) for _ in range(300))
+    assert len(tracker.last(topics.SEEDING)) == 256
+
+
 def test_another_rig_hears_nothing(rig_name: str) -> None:
     with_hub = Hub()
     here, there = (Bus(with_hub.connect(), name, "source") for name in ("here", "there"))
