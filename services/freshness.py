@@ -68,6 +68,14 @@ class Freshness:
         return not self.reason
 
     @property
+    def left_ns(self) -> int:
+        """Until the message is stale if nothing else comes; 0 when it is."""
+        if not self.live:
+            return 0
+        by_age = PERIODS * self.period_ns - self.age_ns
+        return min(by_age, round(_SILENCE * self.period_ns) - self.silence_ns)
+
+    @property
     def reason(self) -> str:
         """Why the message is stale, in words; empty when it is live."""
         if self.period_ns <= 0:

@@ -1,0 +1,274 @@
+"""The tracked threads from a program of one's own, without a word of Zenoh.
+
+    from services.client import connect
+
+    with connect() as client:
+        client.seed(pixel=(454, 118))
+        for seen in client.states():
+            if not seen.live:
+                ...                                      # stop: `seen.reason` tells why
+            elif seen.state.status is Status.TRACKING:
+                pose = client.grasp(from_end=0.010)
+
+Lengths are in metres, points in the rectified left camera.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
+
+from services import topics
+from services.bus import DEPTH, Bus, NoAnswer
+from services.checks import check, check_name
+from services.freshness import Freshness
+from services.inbox import Inbox
+from services.messages import GraspRequest, SeedReply
+from services.topics import Question
+from services.zenoh_transport import ZenohTransport, load_config, local_config
+from suturetrack.camera import StereoRig
+from suturetrack.grasping import AWAY_FROM_CAMERA, GraspPoint
+from suturetrack.types import Grasp, InputError, Seed, ThreadState
+
+Q = TypeVar("Q")
+A = TypeVar("A")
+Pixel = tuple[float, float]
+Point = tuple[float, float, float]
+
+_ARRIVAL_S = 3.0
+"""How long whoever answers may take to appear."""
+_GRASP_S = 1.0
+
+log = logging.getLogger("suturetrack")
+
+
+class Unavailable(Exception):
+    """Nobody is there to answer; the text says what to start."""
+
+
+class Refused(Exception):
+    """A seed or a grasp was refused; the text says why."""
+
+    def __init__(self, reason: str, candidates: tuple[Pixel, ...] = ()):
+        super().__init__(reason)
+        self.reason = reason
+        self.candidates = candidates
+        """Of a seed on no thread: pixels (u, v) of the raw left image near it that look like thread."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A state as it arrived; how old it is, is judged whenever it is asked."""
+
+    state: ThreadState
+    """Lengths in metres."""
+    arrived_ns: int
+    """By `time.monotonic_ns`."""
+
+    @property
+    def freshness(self) -> Freshness:
+        """How old the state is now."""
+        return Freshness.of(self.state.stamp, self.arrived_ns)
+
+    @property
+    def live(self) -> bool:
+        """Whether the state is recent enough to act on; what it is worth, its status tells."""
+        return self.freshness.live
+
+    @property
+    def reason(self) -> str:
+        """Why the state is stale, in words; empty while it is live."""
+        return self.freshness.reason
+
+
+def connect(rig: str = "rig", zenoh: Path | str | None = None) -> Client:
+    """A client of a running system; to be used in a `with` statement.
+
+    Args:
+        rig: name of the rig.
+        zenoh: a Zenoh configuration file that leads to another machine; without it, the system runs
+            on this one.
+
+    Raises:
+        InputError: a bad name, or a configuration that cannot be used.
+    """
+    try:
+        check_name(rig, "rig")
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    config = local_config(rig, "client") if zenoh is None else load_config(Path(zenoh))
+    return Client(Bus(ZenohTransport(config), rig, "client"))
+
+
+class Client:
+    """What a consumer and operator of a rig can do."""
+
+    def __init__(self, bus: Bus):
+        self.bus = bus
+        self._reader = bus.every(topics.STATE)
+        self._lock = threading.Lock()
+        self._latest: dict[str, Seen] = {}
+        self._listeners: dict[Inbox[Seen], str | None] = {}
+        self._given_up = 0
+        threading.Thread(target=self._listen, name="states", daemon=True).start()
+
+    @property
+    def threads(self) -> tuple[str, ...]:
+        """Names of the threads of which a state has arrived."""
+        with self._lock:
+            return tuple(self._latest)
+
+    @property
+    def missed(self) -> int:
+        """States that were published since the connection and never read: gaps in their numbers, and
+        those that a loop over `states` was too slow for."""
+        with self._lock:
+            return self._reader.dropped + self._given_up + sum(i.given_up for i in self._listeners)
+
+    def latest(self, thread: str = "0") -> Seen | None:
+        """The newest state of a thread; None before the first one."""
+        with self._lock:
+            return self._latest.get(thread)
+
+    def states(self, thread: str | None = None) -> Iterator[Seen]:
+        """Every state from now on, as it arrives, of one thread or of all.
+
+        When no live state is left, the last one comes once more, stale, so that a loop hears of the
+        silence without a clock of its own. Ends when the client is closed.
+        """
+        inbox: Inbox[Seen] = Inbox(self.bus.stop, DEPTH)
+        with self._lock:
+            self._listeners[inbox] = thread
+        try:
+            last = None
+            while not self.bus.stop.is_set:
+                left_s = None if last is None else last.freshness.left_ns / 1e9
+                seen = inbox.get(left_s)
+                if seen is not None:
+                    yield seen
+                    last = seen if seen.live else None
+                elif last is not None and not last.live:
+                    yield last
+                    last = None
+        finally:
+            with self._lock:
+                del self._listeners[inbox]
+                self._given_up += inbox.given_up
+
+    def watch(self, callback: Callable[[Seen], None], thread: str | None = None) -> None:
+        """Calls back from a thread of its own for all that `states` gives."""
+
+        def follow() -> None:
+            for seen in self.states(thread):
+                try:
+                    callback(seen)
+                except Exception:
+                    log.exception("a callback failed on frame %d", seen.state.stamp.frame)
+
+        threading.Thread(target=follow, name="watch", daemon=True).start()
+
+    def seed(
+        self,
+        pixel: Pixel | None = None,
+        *,
+        point: Point | None = None,
+        thread: str = "0",
+        timeout: float = 10.0,
+    ) -> SeedReply:
+        """Has a thread looked for, and waits for what is found.
+
+        Args:
+            pixel: (u, v) in the raw left image.
+            point: (x, y, z) instead of a pixel, m.
+            thread: name; a thread that has it is looked for anew.
+            timeout: seconds.
+
+        Raises:
+            Refused: there is no thread.
+            Unavailable: nobody answers.
+            InputError: not exactly one place, or a bad name.
+        """
+        reply = self._ask(topics.SEED, Seed(thread, pixel, point), timeout)
+        if not reply.accepted:
+            raise Refused(reply.reason, reply.candidates)
+        return reply
+
+    def grasp(
+        self,
+        thread: str = "0",
+        *,
+        from_start: float | None = None,
+        from_end: float | None = None,
+        fraction: float | None = None,
+        near: Point | None = None,
+        approach: Point = AWAY_FROM_CAMERA,
+    ) -> Grasp:
+        """The gripper's pose at one place of a thread, now; see `suturetrack.grasping.grasp`.
+
+        Args:
+            thread: name.
+            from_start: arc length from the start of the curve, m.
+            from_end: arc length from its end, m.
+            fraction: of the length, from the start, in [0, 1].
+            near: the place nearest to this point, m.
+            approach: direction in which the gripper moves in; any length.
+
+        Raises:
+            Refused: there is no such thread, it is lost or unseen there, or the state is stale.
+            Unavailable: nobody answers.
+            InputError: not exactly one place, or no direction.
+        """
+        where = GraspPoint(from_start, from_end, fraction, near)
+        reply = self._ask(topics.GRASP, GraspRequest(thread, where, approach), _GRASP_S)
+        if reply.grasp is None:
+            raise Refused(reply.reason)
+        return reply.grasp
+
+    def calibration(self) -> StereoRig:
+        """The cameras, in the calibration's own unit; raises Unavailable."""
+        return self._ask(topics.CALIBRATION, None, _ARRIVAL_S)
+
+    def close(self) -> None:
+        """Ends every loop and the connection."""
+        self.bus.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _ask(self, question: Question[Q, A], content: Q, timeout: float) -> A:
+        try:
+            check(content)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+        # The processes of a rig appear a moment after the connection was opened.
+        if not self.bus.wait_for_alive(question.server, _ARRIVAL_S):
+            raise Unavailable(
+                f"no {question.server} runs on rig {self.bus.rig!r}; start one with "
+                "`suturetrack run`, or name the rig that runs"
+            )
+        try:
+            return self.bus.ask(question, content, timeout)
+        except NoAnswer as error:
+            raise Unavailable(f"the {question.server} does not answer: {error}") from error
+
+    def _listen(self) -> None:
+        for state in self._reader:
+            seen = Seen(state, self._reader.arrived_ns)
+            with self._lock:
+                self._latest[state.thread] = seen
+                for inbox, thread in self._listeners.items():
+                    if thread in (None, state.thread):
+                        inbox.put(seen)

@@ -1,0 +1,239 @@
+"""The Python client, against a tracker that is played on the in-memory bus."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services import topics, wire
+from services.bus import Bus
+from services.client import Client, Refused, Seen, Unavailable
+from services.memory_transport import Hub
+from services.messages import GraspReply, SeedReply
+from suturetrack import nurbs
+from suturetrack.types import (
+    Energies,
+    Grasp,
+    InputError,
+    Nurbs,
+    Seed,
+    Stamp,
+    Status,
+    ThreadState,
+)
+
+PERIOD_NS = 33_333_333
+
+
+class Stage:
+    """A tracker that does what it is told, and a client."""
+
+    def __init__(self, curve: Nurbs):
+        self.hub = Hub()
+        self.tracker = Bus(self.hub.connect(), "rig", "tracker")
+        self.client = Client(Bus(self.hub.connect(), "rig", "client"))
+        self.state = ThreadState(
+            Stamp(0, 0, 0, PERIOD_NS),
+            "0",
+            Status.TRACKING,
+            curve,
+            nurbs.length(curve),
+            Energies(),
+            np.full(8, 0.1),
+            np.ones(8, bool),
+        )
+
+    def publish(self, frame: int, thread: str = "0", age_ms: float = 0) -> None:
+        released_ns = time.time_ns() - round(age_ms * 1e6)
+        stamp = Stamp(frame, frame * PERIOD_NS, released_ns, PERIOD_NS)
+        self.tracker.publish(topics.STATE, replace(self.state, stamp=stamp, thread=thread))
+
+
+@pytest.fixture
+def stage(curve: Nurbs) -> Iterator[Stage]:
+    stage = Stage(curve)
+    yield stage
+    stage.client.close()
+    stage.tracker.close()
+
+
+def until(condition: Callable[[], object], seconds: float = 20) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.002)
+
+
+def wait_for_frame(client: Client, frame: int) -> Seen:
+    until(lambda: (s := client.latest()) is not None and s.state.stamp.frame == frame)
+    seen = client.latest()
+    assert seen is not None
+    return seen
+
+
+def follow(stage: Stage, thread: str | None = None) -> list[tuple[str, int, str]]:
+    """What a loop over the states gets: thread, frame, and why it is stale."""
+    got: list[tuple[str, int, str]] = []
+
+    def note(seen: Seen) -> None:
+        got.append((seen.state.thread, seen.state.stamp.frame, seen.reason))
+
+    listeners = len(stage.client._listeners)
+    stage.client.watch(note, thread)
+    until(lambda: len(stage.client._listeners) > listeners)
+    return got
+
+
+def test_states_arrive_in_order_and_by_thread(stage: Stage) -> None:
+    both, one = follow(stage), follow(stage, "b")
+    for frame in range(5):
+        stage.publish(frame, "a")
+        stage.publish(frame, "b")
+    until(lambda: len(both) >= 10 and len(one) >= 5)
+    assert [(t, f) for t, f, _ in both[:10]] == [(t, f) for f in range(5) for t in "ab"]
+    assert [(t, f) for t, f, _ in one[:5]] == [("b", f) for f in range(5)]
+    assert set(stage.client.threads) == {"a", "b"}
+    latest = stage.client.latest("b")
+    assert latest is not None
+    assert latest.state.stamp.frame == 4
+    assert stage.client.latest("c") is None
+    assert stage.client.missed == 0
+
+
+def test_silence_is_told_once_and_in_time(stage: Stage) -> None:
+    """By the client's own clock: nothing arrives to tell it."""
+    got = follow(stage)
+    began = time.time_ns()
+    stage.publish(7)
+    until(lambda: len(got) == 2)
+    assert time.time_ns() - began < 10 * PERIOD_NS
+    assert [(frame, bool(reason)) for _, frame, reason in got] == [(7, False), (7, True)]
+    assert "nothing came" in got[1][2]
+    latest = stage.client.latest()
+    assert latest is not None
+    assert not latest.live
+    stage.publish(8)
+    until(lambda: len(got) == 4)
+    assert [(frame, bool(reason)) for _, frame, reason in got[2:]] == [(8, False), (8, True)]
+
+
+def test_no_live_state_is_older_than_three_periods(stage: Stage) -> None:
+    """Whatever the delay of the last one before the silence."""
+    for frame, delay_ms in enumerate((0, 30, 60, 95)):
+        stage.publish(frame, age_ms=delay_ms)
+        seen = wait_for_frame(stage.client, frame)
+        until(lambda seen=seen: not seen.live)  # type: ignore[misc]
+        assert seen.freshness.left_ns == 0
+        stale_at_ns = seen.state.stamp.released_ns + 3 * PERIOD_NS
+        assert time.time_ns() - stale_at_ns < 5 * PERIOD_NS
+
+
+def test_a_tracker_that_repeats_old_frames_is_stale(stage: Stage) -> None:
+    got = follow(stage)
+    for _ in range(20):
+        stage.publish(3, age_ms=101)
+    until(lambda: len(got) == 20)
+    assert all("old" in reason for _, _, reason in got)
+
+
+def test_gaps_in_the_numbers_are_counted(stage: Stage) -> None:
+    got = follow(stage)
+    sender, key = stage.hub.connect(), "suturetrack/rig/thread/0/state"
+    state = replace(stage.state, stamp=Stamp(0, 0, time.time_ns(), PERIOD_NS))
+    for number in (0, 1, 4, 5, 9):
+        sender.put(key, wire.encode(state, "tracker-1", number), large=False)
+    until(lambda: len(got) >= 5)
+    assert stage.client.missed == 2 + 3
+
+
+def test_a_slow_loop_delays_nobody_and_its_losses_are_counted(stage: Stage) -> None:
+    slow = stage.client.states()
+    thread = threading.Thread(target=lambda: next(slow))
+    thread.start()
+    until(lambda: len(stage.client._listeners) == 1)
+    stage.publish(1)
+    thread.join(10)
+    for frame in range(2, 1100):
+        stage.publish(frame)
+    wait_for_frame(stage.client, 1099)
+    assert stage.client.missed == 1098 - 1024
+    slow.close()
+    assert stage.client.missed == 1098 - 1024
+
+
+def test_a_callback_that_fails_is_called_again(
+    stage: Stage, caplog: pytest.LogCaptureFixture
+) -> None:
+    calls: list[int] = []
+
+    def fail(seen: Seen) -> None:
+        calls.append(seen.state.stamp.frame)
+        raise RuntimeError("mine")
+
+    stage.client.watch(fail)
+    until(lambda: len(stage.client._listeners) == 1)
+    stage.publish(1)
+    stage.publish(2)
+    until(lambda: len(calls) >= 2)
+    assert "a callback failed on frame 1" in caplog.text
+
+
+def test_seeds_are_answered_or_refused(stage: Stage, curve: Nurbs) -> None:
+    asked: list[Seed] = []
+
+    def find(seed: Seed) -> SeedReply:
+        asked.append(seed)
+        if seed.pixel == (1.0, 2.0):
+            return SeedReply(seed.thread, False, "no ridge there", candidates=((5.0, 6.0),))
+        return SeedReply(seed.thread, True, "found 10 mm", Stamp(0, 0, 0), curve)
+
+    stage.tracker.answer(topics.SEED, find)
+    stage.tracker.declare_alive()
+    reply = stage.client.seed((3.0, 4.0), thread="a")
+    assert reply.curve is not None
+    assert stage.client.seed(point=(0.1, 0.2, 0.3)).accepted
+    assert [(s.thread, s.pixel, s.point) for s in asked] == [
+        ("a", (3.0, 4.0), None),
+        ("0", None, (0.1, 0.2, 0.3)),
+    ]
+    with pytest.raises(Refused, match="no ridge there") as refusal:
+        stage.client.seed((1.0, 2.0))
+    assert refusal.value.candidates == ((5.0, 6.0),)
+    with pytest.raises(InputError, match="exactly one"):
+        stage.client.seed()
+    with pytest.raises(InputError, match="thread 'a/b'"):
+        stage.client.seed((1.0, 2.0), thread="a/b")
+
+
+def test_grasps_are_answered_or_refused(stage: Stage) -> None:
+    pose = Grasp(Stamp(0, 0, 0), "0", np.ones(3), np.eye(3), 1e-4)
+    stage.tracker.answer(
+        topics.GRASP,
+        lambda request: (
+            GraspReply("0", pose)
+            if request.where.from_end == 0.01
+            else GraspReply("0", None, "thread '0' is lost")
+        ),
+    )
+    stage.tracker.declare_alive()
+    assert stage.client.grasp(from_end=0.01).sigma == 1e-4
+    with pytest.raises(Refused, match="is lost"):
+        stage.client.grasp(fraction=0.5)
+    with pytest.raises(InputError, match="exactly one"):
+        stage.client.grasp(fraction=0.5, from_end=0.1)
+
+
+def test_nobody_there_is_said_plainly(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.client._ARRIVAL_S", 0.05)
+    with pytest.raises(Unavailable, match="no tracker runs on rig 'rig'"):
+        stage.client.grasp(fraction=0.5)
+    with pytest.raises(Unavailable, match="no source runs"):
+        stage.client.calibration()
+    stage.tracker.declare_alive()
+    with pytest.raises(Unavailable, match="does not answer"):
+        stage.client.grasp(fraction=0.5)
