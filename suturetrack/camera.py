@@ -73,8 +73,8 @@ class StereoRig:
                 *left,
                 *right,
                 image_size,
-                rotation,
-                translation.reshape(3, 1),
+                np.ascontiguousarray(rotation),
+                np.ascontiguousarray(translation).reshape(3, 1),
                 flags=cv2.CALIB_ZERO_DISPARITY,
             )
             rotations, projections = (r1, r2), (p1, p2)

@@ -93,3 +93,44 @@ def test_cameras_that_are_not_left_and_right_are_refused() -> None:
         StereoRig.from_calibration(
             (640, 480), (k, none), (k, none), np.eye(3), np.array([0.0, -40, 0]), 1e-3
         )
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 1.5])
+def test_a_resized_rig_sees_the_same_points_in_resized_images(
+    distorted_rig: StereoRig, factor: float
+) -> None:
+    resized = distorted_rig.resized(factor)
+    assert resized.image_size == (640 * factor, 480 * factor)
+    # OpenCV's resize keeps the image's edges, half a pixel outside of the corner pixel's centre.
+    raw, expected = resized.project_raw(POINTS), distorted_rig.project_raw(POINTS)
+    for mine, first in zip(raw, expected, strict=True):
+        np.testing.assert_allclose(mine + 0.5, factor * (first + 0.5), atol=1e-9)
+    np.testing.assert_allclose(resized.triangulate(*resized.project(POINTS)), POINTS, atol=1e-7)
+
+
+def test_a_resized_image_fits_the_resized_rig(distorted_rig: StereoRig) -> None:
+    dot = np.zeros((480, 640), np.float32)
+    u, v = distorted_rig.project_raw(POINTS[0])[0]
+    cv2.circle(dot, (round(u * 16), round(v * 16)), 80, 255, -1, cv2.LINE_AA, 4)
+    half = cv2.resize(dot, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    rows, columns = np.mgrid[:240, :320]
+    centre = np.array([(half * columns).sum(), (half * rows).sum()]) / half.sum()
+    np.testing.assert_allclose(
+        centre, distorted_rig.resized(0.5).project_raw(POINTS[0])[0], atol=0.1
+    )
+
+
+def test_a_rig_for_rectified_images_keeps_its_frame_and_its_projections(
+    distorted_rig: StereoRig,
+) -> None:
+    rectified = distorted_rig.for_rectified_images()
+    assert rectified.is_rectified
+    assert rectified.baseline == distorted_rig.baseline
+    np.testing.assert_array_equal(rectified.project(POINTS), distorted_rig.project(POINTS))
+    np.testing.assert_array_equal(rectified.project_raw(POINTS), distorted_rig.project(POINTS))
+
+
+def test_the_pose_between_the_cameras_is_told_as_it_was_given(distorted_rig: StereoRig) -> None:
+    rotation, translation = distorted_rig.right_from_left
+    np.testing.assert_allclose(translation, [-40.0, 0.6, 0.9], atol=1e-9)
+    np.testing.assert_allclose(cv2.Rodrigues(rotation)[0].ravel(), [0, np.radians(3), 0], atol=1e-9)

@@ -1,0 +1,75 @@
+"""OpenCV FileStorage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from suturetrack.calibration.pair import Lens, rig_of_pair
+from suturetrack.camera import StereoRig
+from suturetrack.types import Float64, InputError
+
+_SHAPES = {"K1": (3, 3), "K2": (3, 3), "R": (3, 3), "D1": None, "D2": None, "T": None}
+_MODEL = "distortion_model"
+"""An entry of our own: "equidistant" where D1 and D2 are those of `cv2.fisheye`."""
+
+
+def read(path: Path, unit: str | None, where: str) -> StereoRig:
+    """The rig of a FileStorage file; raises InputError."""
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError) as error:
+        raise InputError(f"{where}: not an OpenCV FileStorage file") from error
+    try:
+        entries = {name: _matrix(storage, name, where, shape) for name, shape in _SHAPES.items()}
+        size = _matrix(storage, "ImageSize", where, None).ravel()
+        model = storage.getNode(_MODEL)
+        fisheye = not model.empty() and model.string() == "equidistant"
+    finally:
+        storage.release()
+    if size.size != 2:
+        raise InputError(f"{where}: ImageSize {size.tolist()} must be [width, height] in pixels")
+    left, right = (
+        Lens(entries[k], entries[d].ravel(), fisheye, (k, d))
+        for k, d in (("K1", "D1"), ("K2", "D2"))
+    )
+    pose = entries["R"], entries["T"].ravel()
+    return rig_of_pair((int(size[0]), int(size[1])), left, right, pose, unit, where)
+
+
+def save_calibration(path: Path | str, rig: StereoRig) -> None:
+    """Writes the rig as an OpenCV FileStorage file that `load_calibration` reads back.
+
+    The rectified frame of what is read back is the one that OpenCV chooses; R1 R2 P1 P2 tell that
+    of this rig.
+    """
+    rotation, translation = rig.right_from_left
+    entries: dict[str, Float64] = {"R": rotation, "T": translation.reshape(3, 1)}
+    for number, camera in ((1, rig.left), (2, rig.right)):
+        entries[f"K{number}"] = camera.matrix
+        entries[f"D{number}"] = camera.distortion.reshape(1, -1)
+        entries[f"R{number}"] = camera.rectification
+        entries[f"P{number}"] = camera.projection
+    entries["ImageSize"] = np.array([rig.image_size], dtype=float)
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in entries.items():
+        storage.write(name, np.ascontiguousarray(value))
+    if rig.left.fisheye:
+        storage.write(_MODEL, "equidistant")
+    storage.release()
+
+
+def _matrix(
+    storage: cv2.FileStorage, name: str, where: str, shape: tuple[int, int] | None
+) -> Float64:
+    node = storage.getNode(name)
+    value = None if node.empty() else node.mat()
+    if value is None:
+        raise InputError(f"{where}: no matrix {name}; it needs K1 D1 K2 D2 R T ImageSize")
+    if not np.isfinite(value).all():
+        raise InputError(f"{where}: {name} holds values that are not finite")
+    if shape is not None and value.shape != shape:
+        raise InputError(f"{where}: {name} is {value.shape}, it must be {shape}")
+    return np.asarray(value, dtype=np.float64)
