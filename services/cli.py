@@ -45,6 +45,11 @@ VERBS = {
     "replay": _Verb("services.replay", "ReplayConfig", "a run once more through today's code"),
     "export": _Verb("services.export", "ExportConfig", "the states of a run as JSON lines"),
     "view": _Verb("services.view", "ViewConfig", "a run, or what runs now, in the Rerun viewer"),
+    "seed": _Verb("services.seed", "SeedConfig", "tell the running tracker where a thread is"),
+    "grasp": _Verb("services.grasp", "GraspConfig", "ask where a gripper should take a thread"),
+    "calibration": _Verb(
+        "services.calibration", "CalibrationConfig", "check a calibration, also against images"
+    ),
     "scenes": _Verb("services.scenes", "ScenesConfig", "pictures of the synthetic bench top"),
     "bench": _Verb("services.bench", "BenchConfig", "accuracy and speed beside references"),
     "source": _Verb("services.source", "SourceConfig", "the process that releases frames", True),

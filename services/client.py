@@ -47,11 +47,11 @@ _GRASP_S = 1.0
 log = logging.getLogger("suturetrack")
 
 
-class Unavailable(Exception):
+class Unavailable(InputError):
     """Nobody is there to answer; the text says what to start."""
 
 
-class Refused(Exception):
+class Refused(InputError):
     """A seed or a grasp was refused; the text says why."""
 
     def __init__(self, reason: str, candidates: tuple[Pixel, ...] = ()):

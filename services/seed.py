@@ -1,0 +1,44 @@
+"""`suturetrack seed`: tells a running tracker where a thread is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from services.client import Refused, connect
+from suturetrack.types import InputError
+
+
+@dataclass(frozen=True)
+class SeedConfig:
+    """Tells a running tracker where a thread is, and waits for what it finds."""
+
+    pixel: Annotated[tuple[float, float] | None, tyro.conf.Positional] = None
+    """U V of a pixel on the thread in the raw left image."""
+    point: tuple[float, float, float] | None = None
+    """X Y Z of a point on the thread instead, in metres, in the rectified left camera."""
+    thread: str = "0"
+    """Name of the thread; one that has the name already is looked for anew."""
+    rig: str = "rig"
+    """Name of the rig."""
+    zenoh: Path | None = None
+    """The Zenoh configuration file of the running system, if it has one."""
+
+
+def run(config: SeedConfig) -> None:
+    """Seeds once.
+
+    Raises:
+        InputError: no system runs, or there is no thread at that place.
+    """
+    with connect(config.rig, config.zenoh) as client:
+        try:
+            found = client.seed(config.pixel, point=config.point, thread=config.thread)
+        except Refused as refusal:
+            near = ", ".join(f"{u:.0f} {v:.0f}" for u, v in refusal.candidates)
+            hint = f"; pixels that look like thread: {near}" if near else ""
+            raise InputError(f"{refusal}{hint}") from refusal
+    print(f"thread {config.thread}: {found.reason}")
