@@ -4,6 +4,9 @@ The second derivatives that eq. (1) looks at are linear in the channels. Across 
 a vector h, one number a channel; everywhere else they scatter with a covariance C. Then
 w = C^-1 h is Fisher's mix: in no other does the thread stand out more from texture, noise, and the
 highlights that make h itself vary along the thread. In it the thread is dark.
+
+What is learned is kept relative to the mean of each channel, so that it holds under another exposure
+and white balance, and in the other camera.
 """
 
 from __future__ import annotations
@@ -35,25 +38,55 @@ _FLOOR = 1.0
 _SHADOW = 0.05
 # A mix that is not better than gray by this factor is not worth its noise.
 _WORTH = 1.1
+# Along a curve: how many windows are looked at, and half their width.
+_WINDOWS, _HALF_PX = 10, 32
+# Least cosine between what two looks at one thread show: 0.7 and more, at other threads less.
+_ALIKE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Contrast:
-    """How to see a thread."""
+    """How to see a thread; grey levels are counted in means of their channel."""
 
     weights: Float64
-    """(channels,) the mix in which the thread is dark; magnitudes add up to 1."""
+    """(3,) of blue, green and red: the mix in which the thread is dark; magnitudes add up to 1."""
     across: Float64
-    """(channels,) second derivative across the thread in its middle, times sigma^2, grey levels:
-    positive where the thread is dark."""
+    """(3,) second derivative across the thread in its middle, times sigma^2: positive where the
+    thread is dark."""
+    clutter: Float64
+    """(3, 3) covariance of the second derivatives around the thread."""
     sigma: float
     """Scale that suits the thread's width, px."""
 
-    def towards(self, other: Contrast, share: float) -> Contrast:
-        """The contrast `share` of the way from this one to `other`."""
-        weights = (1 - share) * self.weights + share * other.weights
-        across = (1 - share) * self.across + share * other.across
-        return Contrast(weights / np.abs(weights).sum(), across, self.sigma)
+    def stands_out(self, weights: Float64) -> float:
+        """By how many deviations of the clutter the thread is darker in a mix."""
+        return float(weights @ self.across / math.sqrt(weights @ self.clutter @ weights))
+
+    def follow(self, seen: Contrast, share: float) -> Contrast:
+        """`share` of the way to what was `seen`; this one where that was hardly the same thread."""
+        metric = np.linalg.inv(self.clutter + seen.clutter)
+        ours, theirs, both = (
+            a @ metric @ b
+            for a, b in ((self.across,) * 2, (seen.across,) * 2, (self.across, seen.across))
+        )
+        distinct = seen.stands_out(seen.weights) >= _LEAST_SCORE
+        if not distinct or both < _ALIKE * math.sqrt(ours * theirs):
+            return self
+        weights, across, clutter = (
+            (1 - share) * old + share * new
+            for old, new in (
+                (self.weights, seen.weights),
+                (self.across, seen.across),
+                (self.clutter, seen.clutter),
+            )
+        )
+        return Contrast(weights / np.abs(weights).sum(), across, clutter, self.sigma)
+
+
+def channel_means(image: Image) -> Float64:
+    """(3,) means of blue, green and red, at least 1; thrice the same for a gray image."""
+    means = np.maximum(image[::16, ::16].mean((0, 1), keepdims=image.ndim == 2), 1.0)
+    return np.array(np.broadcast_to(means.ravel(), 3))
 
 
 def contrast_at(image: Image, pixel: tuple[float, float]) -> Contrast | None:
@@ -77,24 +110,33 @@ def contrast_at(image: Image, pixel: tuple[float, float]) -> Contrast | None:
     # The response is strongest where sigma is half the width; the middle is seen best below that.
     # Of scales that respond alike the smaller one keeps neighbours apart.
     _, sigma, ridge = max(found, key=lambda f: f[0] * f[1] ** -0.4)
-    return _contrast(_Scene.of(crop, max(SIGMAS[0], 0.6 * sigma)), ridge)
+    sigma = max(SIGMAS[0], 0.6 * sigma)
+    scene = _Scene.of(crop, sigma)
+    return _contrast(scene.clutter, ridge.across(scene), sigma, channel_means(image))
 
 
 def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
-    """The contrast of the thread whose middle runs through `pixels`.
+    """The contrast of the thread whose middle runs through `pixels`, from windows along it.
 
     Args:
         image: (H, W, 3) BGR or (H, W) gray, uint8.
         pixels: (N, 2) inside that image, in order along the thread, N >= 8.
         sigma: scale that suits the thread's width, px.
     """
-    low = np.maximum(pixels.min(0).astype(int) - _WINDOW_PX // 2, 0)
-    high = pixels.max(0).astype(int) + _WINDOW_PX // 2
-    crop = image[low[1] : high[1], low[0] : high[0]]
     tangents = np.gradient(pixels, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
     normals = tangents[:, ::-1] * (-1, 1)
-    return _contrast(_Scene.of(crop, sigma), _Ridge(pixels - low, normals))
+    across, clutter = [], []
+    for i in np.linspace(0, len(pixels) - 1, min(_WINDOWS, len(pixels))).round().astype(int):
+        crop, centre = _window(image, pixels[i], _HALF_PX)
+        scene = _Scene.of(crop, sigma)
+        # At the rim of the window, the filter would look beyond it.
+        near = np.abs(pixels - pixels[i]).max(1) <= _HALF_PX - 3 * sigma
+        ridge = _Ridge(pixels[near] - pixels[i] + centre, normals[near])
+        across.append(ridge.across(scene))
+        clutter.append(scene.clutter)
+    middle = np.concatenate(across)
+    return _contrast(np.mean(clutter, axis=0), middle, sigma, channel_means(image))
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +189,13 @@ class _Ridge:
         return nu * nu * uu + 2 * nu * nv * uv + nv * nv * vv
 
 
-def _window(image: Image, pixel: tuple[float, float]) -> tuple[Image, Float64]:
-    left, top = (max(round(x) - _WINDOW_PX, 0) for x in pixel)
-    crop = image[top : round(pixel[1]) + _WINDOW_PX, left : round(pixel[0]) + _WINDOW_PX]
-    return crop, np.array(pixel) - (left, top)
+def _window(
+    image: Image, pixel: tuple[float, float] | Float64, half: int = _WINDOW_PX
+) -> tuple[Image, Float64]:
+    """The image around a pixel, and where the pixel is in it."""
+    u, v = (round(float(x)) for x in pixel)
+    left, top = max(u - half, 0), max(v - half, 0)
+    return image[top : v + half, left : u + half], np.array(pixel) - (left, top)
 
 
 def _starts(scene: _Scene, seed: Float64) -> list[tuple[int, int]]:
@@ -221,17 +266,21 @@ def _score(scene: _Scene, weights: Float64, ridge: _Ridge, covariance: Float64) 
     return (middle - max(rim, 0.0)) / max(math.sqrt(weights @ covariance @ weights), 1e-9)
 
 
-def _contrast(scene: _Scene, ridge: _Ridge) -> Contrast:
-    across = ridge.across(scene)
-    middle = np.median(across, axis=0)
-    weights = _fisher(scene.clutter, across)
-    if len(weights) == 3:
-        total = scene.clutter + np.cov(across.T)
+def _contrast(clutter: Float64, across: Float64, sigma: float, means: Float64) -> Contrast:
+    """From the (channels, channels) clutter and (N, channels) derivatives across, grey levels."""
+    middle, weights = np.median(across, axis=0), _fisher(clutter, across)
+    if len(weights) == 1:
+        weights, middle, clutter = weights * GRAY, np.repeat(middle, 3), np.full((3, 3), clutter)
+        clutter = clutter + 1e-3 * clutter[0, 0] * np.eye(3)
+    else:
+        total = clutter + np.cov(across.T)
         gray = GRAY * np.sign(middle @ GRAY)
         shown = [middle @ w / math.sqrt(w @ total @ w) for w in (weights, gray)]
         if shown[0] < _WORTH * shown[1]:
             weights = gray
-    return Contrast(weights, middle, scene.sigma)
+    weights = weights * means
+    clutter = clutter / np.outer(means, means)
+    return Contrast(weights / np.abs(weights).sum(), middle / means, clutter, sigma)
 
 
 def _dark_ridge(scene: _Scene, weights: Float64, start: tuple[int, int]) -> _Ridge | None:

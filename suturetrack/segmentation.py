@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -10,7 +11,14 @@ import cv2
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.contrast import GRAY, SIGMAS, Contrast, contrast_along, contrast_at
+from suturetrack.contrast import (
+    GRAY,
+    SIGMAS,
+    Contrast,
+    channel_means,
+    contrast_along,
+    contrast_at,
+)
 from suturetrack.kernels import ridge
 from suturetrack.types import Float32, Float64, Image, InputError, RidgeField, Seed, StereoFrame
 
@@ -33,6 +41,8 @@ _SLOTS = 4
 _PULL, _ADAPT = 0.1, 0.2
 # Fewest pixels of a curve from which contrast is learned.
 _FEWEST_PIXELS = 8
+# Worth of a mix in which some threads are dark and others bright, so that both must be looked for.
+_BOTH_SIGNS = 0.7
 # Least automatic c, grey levels: what a flawless picture's rounding makes.
 _LEAST_C = 1.0
 
@@ -117,7 +127,7 @@ class Segmenter:
         contrast = contrast_at(image, pixel)
         if contrast is not None:
             self._threads[seed.thread] = contrast
-            self._relook(image)
+            self._relook()
 
     def adapt(self, frame: StereoFrame, pixels: Float64, thread: str = "0") -> None:
         """Follow slow changes of the light: go a part of the way to what a held curve shows.
@@ -132,16 +142,13 @@ class Segmenter:
         """
         self._check(frame)
         width, height = self._rig.image_size
-        pixels = self._rig.rectify_pixels(pixels)
         inside = (pixels >= 0).all(1) & (pixels <= (width - 1, height - 1)).all(1)
         if thread not in self._threads or np.count_nonzero(inside) < _FEWEST_PIXELS:
             return
         old = self._threads[thread]
-        image = self._rig.rectify(frame.left, frame.right)[0]
-        new = contrast_along(image, pixels[inside], old.sigma)
-        if new.across @ old.weights > 0:
-            self._threads[thread] = old.towards(new, _ADAPT)
-            self._relook(image)
+        seen = contrast_along(frame.left, pixels[inside], old.sigma)
+        self._threads[thread] = old.follow(seen, _ADAPT)
+        self._relook()
 
     def warm_up(self) -> None:
         """Compile (or load) the kernels, so that the first frame is as quick as the next."""
@@ -176,51 +183,68 @@ class Segmenter:
             )
         return float(u), float(v)
 
-    def _relook(self, image: Image) -> None:
-        self._look = _learned_look(self._config, list(self._threads.values()), _brightness(image))
+    def _relook(self) -> None:
+        self._look = _learned_look(self._config, list(self._threads.values()))
 
 
 @dataclass(frozen=True, eq=False)
 class _Look:
     """What is looked for, in both views."""
 
-    weights: Float32
-    """(3,) of blue, green and red, whole 256ths: sums of grey values are exact in float32."""
+    weights: Float64
+    """(3,) of blue, green and red."""
+    relative: bool
+    """Whether the weights are those of channels divided by their means."""
     sigmas: tuple[float, ...]
     signs: tuple[float, float]
     """See `ridge.ridge_vectors`."""
-    relative_c: float | None
-    """c as a share of the brightness; None until it is learned."""
+    across: Float64 | None = None
+    """(threads, 3) of `Contrast.across`; None until a thread is learned."""
+
+    def mix(self, means: Float64) -> tuple[Float32, float | None]:
+        """The weights for an image with such means, and c, if it was learned.
+
+        The weights are whole 256ths: sums of grey values are exact in float32.
+        """
+        weights = self.weights / means if self.relative else self.weights
+        weights = np.rint(weights / np.abs(weights).sum() * 256) / 256
+        c = None
+        if self.across is not None:
+            c = float(np.abs(self.across * means @ weights).min()) / 2
+        return weights.astype(np.float32), c
 
 
 def _first_look(config: SegmentationConfig) -> _Look:
-    weights = _exact(_WEIGHTS[config.channel])
-    return _Look(weights, config.sigmas or SIGMAS[:1], _SIGNS[config.polarity], None)
+    sigmas = config.sigmas or SIGMAS[:1]
+    return _Look(_WEIGHTS[config.channel], False, sigmas, _SIGNS[config.polarity])
 
 
-def _learned_look(config: SegmentationConfig, threads: list[Contrast], brightness: float) -> _Look:
-    signs = _SIGNS[config.polarity]
-    if config.channel == "learned":
-        weights = np.mean(
-            [t.weights if len(t.weights) == 3 else t.weights * GRAY for t in threads], 0
-        )
-    else:
-        weights = _WEIGHTS[config.channel]
-    shown = np.array([np.broadcast_to(t.across, 3) for t in threads]) @ weights
+def _learned_look(config: SegmentationConfig, threads: list[Contrast]) -> _Look:
+    signs, relative = _SIGNS[config.polarity], config.channel == "learned"
+    weights = _joint_mix(threads, config.polarity) if relative else _WEIGHTS[config.channel]
+    across = np.array([t.across for t in threads])
+    shown = across @ weights
     if config.polarity == "auto" and (shown < 0).any():
         signs = _SIGNS["bright" if (shown < 0).all() else "both"]
-    elif config.polarity == "bright" and config.channel == "learned":
-        weights = -weights
     sigmas = config.sigmas or tuple(sorted({t.sigma for t in threads}))
-    return _Look(_exact(weights), sigmas, signs, float(np.abs(shown).min()) / 2 / brightness)
+    return _Look(weights, relative, sigmas, signs, across)
 
 
-def _exact(weights: Float64) -> Float32:
-    return (np.rint(weights / np.abs(weights).sum() * 256) / 256).astype(np.float32)
+def _joint_mix(threads: list[Contrast], polarity: Polarity) -> Float64:
+    """The mix in which the thread that stands out least stands out most."""
+    if polarity == "bright":
+        return -_joint_mix(threads, "dark")
+    ways = itertools.product(*[(1.0,)] + [(1.0, 0.0, -1.0)] * (len(threads) - 1))
+    own = [t.weights / math.sqrt(t.weights @ t.clutter @ t.weights) for t in threads]
+    mixes = [np.tensordot(way, own, 1) for way in ways] + own
 
+    def least(mix: Float64) -> float:
+        shown = np.array([t.stands_out(mix) for t in threads])
+        if (shown > 0).all():
+            return float(shown.min())
+        return _BOTH_SIGNS * float(np.abs(shown).min()) if polarity in ("auto", "both") else 0.0
 
-def _brightness(image: Image) -> float:
-    return max(float(image[::16, ::16].mean()), 1.0)
+    return np.asarray(max(mixes, key=least))
 
 
 class _View:
@@ -235,26 +259,28 @@ class _View:
         self._outputs = np.empty((_SLOTS, height, width, 2), np.float32)
         self._relative_c: float | None = None
         self._brightness = 1.0
+        self._c: float | None = None
         self.plane = np.empty((height, width), np.float32)
         self.rectified = np.empty((height, width), np.float32)
 
     def see(self, image: Image, look: _Look) -> None:
         """Mix the channels of the raw image into `plane`."""
-        self._brightness = _brightness(image)
+        means = channel_means(image)
+        weights, self._c = look.mix(means)
+        self._brightness = float(np.abs(weights) @ means)
         if image.ndim == 2:
-            np.multiply(image, look.weights.sum(), out=self.plane)
+            np.multiply(image, weights.sum(), out=self.plane)
         else:
             cv2.split(np.ascontiguousarray(image), self._channels)
-            ridge.mix_channels(*self._channels, look.weights, self.plane)
+            ridge.mix_channels(*self._channels, weights, self.plane)
 
     def filter(self, plane: Float32, look: _Look, slot: int) -> Float32:
         """Eq. (1) and Algorithm 1 on the rectified plane, into the slot's buffer."""
-        if self._config.c is not None:
-            self._find_ridges(plane, look, self._config.c)
-        elif look.relative_c is not None:
-            self._find_ridges(plane, look, self._brightness * look.relative_c)
-        else:
+        c = self._config.c or self._c
+        if c is None:
             self._find_ridges_by_their_quantile(plane, look)
+        else:
+            self._find_ridges(plane, look, c)
         ridge.blur_angles(self._vectors, self._kernel, self._outputs[slot])
         return self._outputs[slot]
 

@@ -422,25 +422,72 @@ def test_threads_of_different_colours_are_seen_together() -> None:
     assert strength[75:90, 20:140].mean() < 0.05
 
 
-def test_the_contrast_follows_the_light(scene: Scene) -> None:
-    """The lamp turns from white to blue; who adapts keeps seeing the thread as well as at first."""
-    left, right = scene.render(0)
-    pixels = thread_pixels(scene)
-    following, staying = Segmenter(scene.rig), Segmenter(scene.rig)
-    first = StereoFrame(STAMP, left, right)
+@pytest.mark.parametrize("light", [(1.6, 1.0, 0.45), (0.55, 0.8, 1.15), (0.4, 0.4, 0.4)])
+def test_another_exposure_and_white_balance_show_the_same(
+    scene: Scene, light: tuple[float, float, float]
+) -> None:
+    images, pixels = scene.render(0), thread_pixels(scene)
+    lit = [np.clip(np.rint(image * np.array(light)), 0, 255).astype(np.uint8) for image in images]
+    segmenter = Segmenter(scene.rig)
+    segmenter.learn(StereoFrame(STAMP, *images), Seed(pixel=scene.seed_pixel()))
+    before, after = (
+        np.median(on_thread(segmenter.step(StereoFrame(STAMP, *pair)).left, pixels))
+        for pair in (images, lit)
+    )
+    assert before > 0.3
+    assert abs(after - before) < 0.05
+
+
+@pytest.mark.parametrize("thread", ["violet", "undyed"])
+def test_the_contrast_follows_the_surroundings(thread: str) -> None:
+    """The paper turns to tissue; who adapts sees the thread as if it were learned there."""
+    scenes = [
+        open_scene("figure8-107", 22, picture=Picture(thread, background))
+        for background in ("marbled", "tissue")
+    ]
+    pairs, pixels = [scene.render(0) for scene in scenes], thread_pixels(scenes[0])
+    seed = Seed(pixel=scenes[0].seed_pixel())
+    following, staying, fresh = (Segmenter(scenes[0].rig) for _ in range(3))
     for segmenter in (following, staying):
-        segmenter.learn(first, Seed(pixel=scene.seed_pixel()))
-    fresh = np.median(on_thread(following.step(first).left, pixels))
-    for i in range(1, 25):
-        light = 1 + min(i, 16) / 16 * (np.array([1.9, 1.0, 0.45]) - 1)
-        images = [np.clip(np.rint(x * light), 0, 255).astype(np.uint8) for x in (left, right)]
-        frame = StereoFrame(Stamp(i, 0, 0), *images)
-        following.adapt(frame, pixels[10:-10:5])
-        kept, lost = (
-            np.median(on_thread(s.step(frame).left, pixels)) for s in (following, staying)
-        )
-    assert abs(kept - fresh) < 0.05
-    assert abs(lost - fresh) > 2 * abs(kept - fresh)
+        segmenter.learn(StereoFrame(STAMP, *pairs[0]), seed)
+    steps = []
+    for i in range(1, 20):
+        share = min(i / 10, 1)
+        mixed = [(1 - share) * a + share * b for a, b in zip(*pairs, strict=True)]
+        frame = StereoFrame(Stamp(i, 0, 0), *(np.rint(image).astype(np.uint8) for image in mixed))
+        following.adapt(frame, pixels[10:-10:10])
+        steps.append(np.median(on_thread(following.step(frame).left, pixels)))
+    fresh.learn(frame, seed)
+    kept, lost, best = (
+        np.median(on_thread(s.step(frame).left, pixels)) for s in (following, staying, fresh)
+    )
+    assert abs(kept - best) < 0.08
+    assert abs(lost - best) > 2 * abs(kept - best)
+    assert np.abs(np.diff(steps)).max() < 0.1
+
+
+def test_a_curve_beside_the_thread_teaches_nothing(scene: Scene) -> None:
+    frame, pixels = StereoFrame(STAMP, *scene.render(0)), thread_pixels(scene)[10:-10:10]
+    led, left_alone = Segmenter(scene.rig), Segmenter(scene.rig)
+    for segmenter in (led, left_alone):
+        segmenter.learn(frame, Seed(pixel=scene.seed_pixel()))
+    for offset in ((0, 9), (12, 0), (-20, 20)):
+        led.adapt(frame, pixels + offset)
+    np.testing.assert_array_equal(led.step(frame).left, left_alone.step(frame).left)
+
+
+def test_a_dark_and_a_bright_thread_are_seen_together() -> None:
+    image = np.full((161, 161, 3), (110, 110, 140), np.uint8)
+    for row, colour in ((50, (90, 40, 60)), (110, (215, 220, 230))):
+        cv2.line(image, (0, row), (160, row), colour, 2, cv2.LINE_AA)
+    image = np.clip(image + np.random.default_rng(0).normal(0, 2, image.shape), 0, 255)
+    frame = StereoFrame(STAMP, *[image.astype(np.uint8)] * 2)
+    segmenter = Segmenter(small_rig(161, 161))
+    segmenter.learn(frame, Seed("a", pixel=(80.0, 50.0)))
+    segmenter.learn(frame, Seed("b", pixel=(80.0, 110.0)))
+    strength = np.linalg.norm(segmenter.step(frame).left, axis=-1)
+    assert (strength[[50, 110], 20:140].mean(1) > 0.4).all()
+    assert strength[75:90, 20:140].mean() < 0.05
 
 
 def test_only_learned_threads_adapt(scene: Scene) -> None:
