@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 
-from suturetrack.stage import SCENARIOS, contact_sheet
+from suturetrack.stage import SCENARIOS, Picture, contact_sheet
 from suturetrack.types import InputError
 
 
@@ -23,11 +23,13 @@ class ScenesConfig:
     """Which rig looks: bench or endoscope."""
     seed: int = 0
     """Which variant of each scene."""
+    picture: Picture = field(default_factory=Picture)
+    """How the scenes are filmed."""
 
 
 def run(config: ScenesConfig) -> None:
     """Writes the picture; raises InputError for unknown scenarios and rigs, and unwritable files."""
-    sheet = contact_sheet(config.scenarios, config.rig, config.seed)
+    sheet = contact_sheet(config.scenarios, config.rig, config.seed, config.picture)
     try:
         written = cv2.imwrite(str(config.output), sheet)
     except cv2.error as error:

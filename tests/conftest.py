@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -28,6 +29,14 @@ def make_rig(baseline: float = 40.0, metres_per_unit: float = 1e-3) -> StereoRig
     return StereoRig.from_calibration(
         (640, 480), (k, none), (k, none), np.eye(3), translation, metres_per_unit
     )
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+    """Returns as soon as the condition holds; fails when it does not in time."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
 
 
 @pytest.fixture

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +21,7 @@ from services.bench.tracking import rows as tracking_rows
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.types import Energies, InputError, Nurbs, Stamp, Status, ThreadState, Truth
-from tests.conftest import make_rig
+from tests.conftest import make_rig, wait_until
 
 STAMP = Stamp(0, 0, 0)
 CASE = Case("figure8-175", 1, methods=("paper",))
@@ -171,3 +173,24 @@ def test_rows_are_printed_and_written_whole(tmp_path: Path) -> None:
     assert page.count("<tr>") == 31
     assert "data:image/png;base64," in page
     assert "http" not in page
+
+
+def test_workers_end_with_a_killed_benchmark() -> None:
+    words = ["bench", "tracking", "--scenarios", "fast", "--seeds", "2"]
+    bench = subprocess.Popen(
+        [sys.executable, "-m", "services.cli", *words], stdout=subprocess.DEVNULL
+    )
+    children = Path(f"/proc/{bench.pid}/task/{bench.pid}/children")
+    # Two workers and multiprocessing's resource tracker.
+    wait_until(lambda: len(children.read_text().split()) == 3, 60)
+    workers = [Path("/proc") / pid / "stat" for pid in children.read_text().split()]
+    bench.kill()
+    bench.wait()
+    wait_until(lambda: not any(runs(stat) for stat in workers))
+
+
+def runs(stat: Path) -> bool:
+    try:
+        return stat.read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

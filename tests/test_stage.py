@@ -223,7 +223,7 @@ def test_distorted_lenses_show_the_thread_where_the_calibration_says() -> None:
     pixels = scene.rig.project_raw(scene.truth(0)[0].points)[0]
     assert np.abs(centre_offsets(scene.render(0)[0], pixels)[8:-8]).mean() < 0.1
     assert np.abs(centre_offsets(straight.render(0)[0], pixels)[8:-8]).max() > 1
-    with pytest.raises(InputError, match=r"distortion 3: use -0\.5 to 0\.5"):
+    with pytest.raises(InputError, match=r"picture.distortion 3: use -0\.5 to 0\.5"):
         open_scene("figure8-107", picture=replace(look, distortion=3))
 
 

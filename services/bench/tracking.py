@@ -156,10 +156,14 @@ class Row:
 
 def rows(config: TrackingBench) -> Iterator[list[Row]]:
     """The rows of every case, as they are done."""
-    known = tuple(SCENARIOS)
+    for option in ("seeds", "workers"):
+        if getattr(config, option) < 1:
+            raise InputError(f"{option} {getattr(config, option)}: use 1 or more")
     for name in config.scenarios:
-        if name not in known:
-            raise InputError(f"no scenario {name!r}; there are {', '.join(known)}")
+        if name not in SCENARIOS:
+            raise InputError(f"no scenario {name!r}; there are {', '.join(SCENARIOS)}")
+    if config.seconds is not None and config.seconds * config.fps < 1:
+        raise InputError(f"seconds {config.seconds:g}: that is no frame at {config.fps:g} fps")
     how = config.rig, config.methods, config.fps, config.picture, config.seconds
     cases = [
         Case(name, config.first_seed + k, *how)

@@ -45,6 +45,21 @@ class Picture:
     """Whether the real cameras count pixels from corners, not from centres."""
 
 
+LIMITS = {
+    "shadow": (0, 1),
+    "noise": (0, 50),
+    "blur_px": (0, 20),
+    "defocus_px": (0, 20),
+    "shutter": (0, 1),
+    "vignetting": (0, 1),
+    "drift": (0, 0.9),
+    "jpeg": (1, 100),
+    "distortion": (-0.5, 0.5),
+    "calibration_error_px": (0, 20),
+}
+"""Lowest and highest value of a `Picture`'s numbers."""
+
+
 @dataclass(frozen=True)
 class Surface:
     """What a thread or a tool is made of."""

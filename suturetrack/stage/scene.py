@@ -8,7 +8,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.kernels import tubes
 from suturetrack.metrics import polyline_length
 from suturetrack.stage import appearance, background, clutter
-from suturetrack.stage.appearance import COLOURS, Look, Picture
+from suturetrack.stage.appearance import COLOURS, LIMITS, Look, Picture
 from suturetrack.stage.background import TEXTURES
 from suturetrack.stage.cameras import (
     RIGS,
@@ -59,8 +59,10 @@ def open_scene(
     if min(picture.size) < 64 or fps <= 0:
         width, height = picture.size
         raise InputError(f"images of {width}x{height} at {fps} fps: use 64x64 or more, above 0 fps")
-    if not -0.5 <= picture.distortion <= 0.5:
-        raise InputError(f"distortion {picture.distortion}: use -0.5 to 0.5")
+    for setting, (lowest, highest) in LIMITS.items():
+        value = getattr(picture, setting)
+        if value is not None and not lowest <= value <= highest:
+            raise InputError(f"picture.{setting} {value:g}: use {lowest:g} to {highest:g}")
     for what, known in ((picture.thread, COLOURS), (picture.background, TEXTURES)):
         if what is not None and what not in known:
             raise InputError(f"no look {what!r}; use one of {', '.join(known)}")

@@ -7,8 +7,9 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
+from suturetrack.stage.appearance import Picture
 from suturetrack.stage.scenarios import SCENARIOS
-from suturetrack.stage.scene import open_scene
+from suturetrack.stage.scene import DEFAULT_PICTURE, open_scene
 from suturetrack.types import Image
 
 _MOMENTS = (0.0, 0.3, 0.6, 0.9)
@@ -16,18 +17,21 @@ _WIDTH = 320
 
 
 def contact_sheet(
-    scenarios: Iterable[str] = tuple(SCENARIOS), rig: str = "bench", seed: int = 0
+    scenarios: Iterable[str] = tuple(SCENARIOS),
+    rig: str = "bench",
+    seed: int = 0,
+    picture: Picture = DEFAULT_PICTURE,
 ) -> Image:
     """One row a scenario: its left image at four moments, small; (H, W, 3) uint8 BGR.
 
     Write it with `cv2.imwrite("bench-top.png", contact_sheet())`.
 
     Raises:
-        InputError: there is no such scenario or rig, or the seed is negative.
+        InputError: as `open_scene`.
     """
     rows = []
     for name in scenarios:
-        scene = open_scene(name, seed, rig)
+        scene = open_scene(name, seed, rig, picture=picture)
         pictures = [_small(scene.render(int(m * scene.frame_count))[0]) for m in _MOMENTS]
         row = np.hstack(pictures)
         cv2.putText(
