@@ -161,7 +161,8 @@ def _health(health: Health) -> None:
     for latency in (health.latency, health.run_latency):
         figures += [latency.p50_ms, latency.p99_ms, latency.max_ms]
     _require(np.isfinite(figures).all(), "figures that are not finite")
-    _require(min(health.frames, health.dropped, health.refused) >= 0, "counts that are negative")
+    counts = (health.frames, health.dropped, health.refused, health.restarts)
+    _require(min(counts) >= 0, "counts that are negative")
 
 
 def _rig(rig: StereoRig) -> None:

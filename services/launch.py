@@ -12,6 +12,7 @@ import time
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -60,6 +61,9 @@ class RunConfig:
     further thread. The bench top knows its own."""
     view: bool = False
     """Show the run in the Rerun viewer while it goes on."""
+    restarts: int = 5
+    """How often within a minute a process that died is started again before the run is given up; 0 is
+    never, as in lock-step, which has to be the same from beginning to end."""
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
@@ -179,13 +183,15 @@ def _watch(config: RunConfig, console: Console, stack: ExitStack) -> Monitor:
     bus = Bus(ZenohTransport(zenoh), service.rig, "run")
     stack.callback(bus.close)
     monitor = Monitor(bus)
-    fleet = Fleet(_launches(config), console.print)
+    budget = 0 if service.lockstep else config.restarts
+    say = partial(console.print, markup=False, soft_wrap=True)
+    fleet = Fleet(_launches(config), say, budget)
     if config.view:
         stack.callback(_show(service).terminate)
     try:
         with closing(_glances(monitor, console)) as glances:
             for _ in glances:
-                if stop or fleet.has_ended():
+                if stop or not fleet.tend():
                     break
     finally:
         fleet.stop()

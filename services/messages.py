@@ -44,6 +44,8 @@ class Health:
     """Resident memory."""
     warning: str = ""
     """What a person should know, for example that recording stopped; empty when all is well."""
+    restarts: int = 0
+    """How often the process died before and was started again."""
 
 
 @dataclass(frozen=True)

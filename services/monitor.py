@@ -51,8 +51,7 @@ class Monitor:
         if not self._health:
             return "waiting for source, segmenter and tracker"
         parts = [
-            f"{name} {health.rate_hz:.1f} Hz" + (" (silent)" if _is_stale(health) else "")
-            for name, health in self._in_order()
+            f"{name} {health.rate_hz:.1f} Hz{_trouble(health)}" for name, health in self._in_order()
         ]
         tracker = self._health.get("tracker")
         if tracker is not None:
@@ -126,6 +125,11 @@ class Monitor:
                 f"{health.memory_mb:.0f}",
             )
         return table
+
+
+def _trouble(health: Health) -> str:
+    again = f" (started again {health.restarts}x)" if health.restarts else ""
+    return again + (" (silent)" if _is_stale(health) else "")
 
 
 def _is_stale(health: Health) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from services import topics
@@ -44,6 +44,18 @@ class SeedDesk:
             _answer(before, SeedReply(seed.thread, False, "another seed took its place"))
         self._cases[seed.thread] = _Case(seed, self._patience, request)
         self._tracker.seed(seed)
+
+    def resume(self, given: Iterable[Seed]) -> None:
+        """Takes up the threads of a tracker that died: from their last states, else from their seeds."""
+        to_units = 1 / self._rig.metres_per_unit
+        asked = [scaled(seed, to_units) for seed in self._bus.last(topics.SEEDING)]
+        last = {state.thread: scaled(state, to_units) for state in self._bus.last(topics.STATE)}
+        for seed in {seed.thread: seed for seed in (*given, *asked)}.values():
+            state = last.get(seed.thread)
+            if state is None or state.curve is None:
+                self._tracker.seed(seed)
+            else:
+                self._tracker.resume(seed, state)
 
     def take_requests(self) -> None:
         """Takes the seeds that have come in."""

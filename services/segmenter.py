@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -9,11 +10,24 @@ import numpy as np
 import tyro
 
 from services import topics
+from services.bus import Bus
 from services.service import Service, ServiceConfig, Stopped
 from services.wire import scaled
+from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.segmentation import SegmentationConfig, Segmenter
-from suturetrack.types import InputError, RidgeField, Seed, Stamp, StereoFrame
+from suturetrack.types import (
+    InputError,
+    RidgeField,
+    Seed,
+    Stamp,
+    Status,
+    StereoFrame,
+    ThreadState,
+)
+
+_RECENT_FRAMES = 3
+"""Frames in which a thread hardly moves."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +47,13 @@ def run(service: Service, config: SegmenterConfig) -> None:
     rig = service.calibrated_rig()
     segmenter = Segmenter(rig, config.segmentation)
     segmenter.warm_up()
-    bus.make_room(_warm_up(rig, config))
+    bus.make_room(warm_up(rig, config))
     recorder = service.record(rig, config)
     seedings = bus.every(topics.SEEDING)
     seeds = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
+    held = _Held(bus, rig) if config.service.resume else None
+    if held is not None:
+        seeds = [seed for seed in seeds if seed.thread not in held.threads]
     if not bus.wait_for_alive("tracker"):
         raise Stopped
     frames = bus.newest(topics.FRAME)
@@ -47,6 +64,8 @@ def run(service: Service, config: SegmenterConfig) -> None:
         try:
             while seeds:
                 segmenter.learn(frame, seeds.pop(0))
+            for place in held.seeds(frame.stamp) if held is not None else ():
+                segmenter.learn(frame, place)
             ridges = segmenter.step(frame)
         except InputError as error:
             frames.refuse(str(error))
@@ -55,7 +74,33 @@ def run(service: Service, config: SegmenterConfig) -> None:
         recorder.field(ridges, service.finished(frame.stamp))
 
 
-def _warm_up(rig: StereoRig, config: SegmenterConfig) -> RidgeField:
+class _Held:
+    """The threads that the tracker holds, from which a segmenter that is started again learns."""
+
+    def __init__(self, bus: Bus, rig: StereoRig):
+        self._states = bus.every(topics.STATE)
+        self._rig = rig
+        self.threads = {s.thread for s in bus.last(topics.STATE) if s.curve is not None}
+        """Names of those of which nothing was learned yet."""
+
+    def seeds(self, now: Stamp) -> Iterator[Seed]:
+        """A place on every further thread that was seen a moment ago."""
+        while (state := self._states.get(0)) is not None:
+            recent = now.frame - state.stamp.frame <= _RECENT_FRAMES
+            if recent and state.status is Status.TRACKING and state.thread in self.threads:
+                self.threads.remove(state.thread)
+                yield _seed_on(scaled(state, 1 / self._rig.metres_per_unit))
+
+
+def _seed_on(state: ThreadState) -> Seed:
+    """The middle of what is seen of a thread."""
+    assert state.curve is not None
+    seen = np.linspace(0, 1, len(state.seen))[state.seen]
+    x, y, z = nurbs.evaluate(state.curve, seen[len(seen) // 2 :][:1])[0]
+    return Seed(state.thread, point=(float(x), float(y), float(z)))
+
+
+def warm_up(rig: StereoRig, config: SegmenterConfig) -> RidgeField:
     """Learns from and segments noise, so that the first frame is not late."""
     width, height = rig.image_size
     noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)

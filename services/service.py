@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -57,6 +57,9 @@ class ServiceConfig:
     """Every frame, in order, the next one only when the tracker is done with this one."""
     parent: int | None = None
     """Process id of the launcher: end when it has gone."""
+    resume: int = 0
+    """How many processes of this name died before this one: from 1 on, it takes up the threads or the
+    count of frames where the last one left them."""
 
 
 class Service:
@@ -129,6 +132,7 @@ class Service:
             refused=self.bus.refused,
             memory_mb=psutil.Process().memory_info().rss / 1e6,
             warning=(self.recorder and self.recorder.problem) or "",
+            restarts=self.config.resume,
         )
 
     def __enter__(self) -> Self:
@@ -171,6 +175,9 @@ def run(name: str, config: ServiceConfig, body: Callable[[Service], None]) -> No
         check_name(config.rig, "rig")
     except ValueError as error:
         raise InputError(str(error)) from error
+    with suppress(OSError):
+        # What `ps` and `top` show.
+        Path("/proc/self/comm").write_text(name)
     zenoh = local_config(config.rig, name) if config.zenoh is None else load_config(config.zenoh)
     bus = Bus(ZenohTransport(zenoh, patient=config.lockstep), config.rig, name)
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -15,12 +16,14 @@ from services.service import Service, ServiceConfig
 from services.sources import Footage, InputConfig, open_input
 from services.sources.footage import Exposure
 from services.wire import scaled
-from suturetrack.types import InputError, Stamp, StereoFrame
+from suturetrack.types import InputError, Stamp, Status, StereoFrame
 
 _LONGEST_STEP_S = 60.0
 """Lock-step: how long the others may take for one frame."""
 _BUFFERED = 4
 """How many frames may be late before some are skipped, as in the buffer of a camera's driver."""
+_KEEPER_S = 2.0
+"""After a death: how long to wait for the process that knows where to go on."""
 _LAST_STEP_S = 2.0
 """In real time: how long the last frame may take to go through."""
 
@@ -49,11 +52,13 @@ def run(service: Service, config: SourceConfig) -> None:
     first = footage.read(0)
     if first is not None:
         bus.make_room(StereoFrame(Stamp(0, 0, 0), first.left, first.right))
+    bus.keep(topics.STATE, lambda state: state.status is not Status.LOST)
+    bus.keep(topics.SEEDING)
     service.ready()
     if not footage.live and not bus.wait_for_alive("segmenter"):
         return
     period_ns = 0 if config.service.lockstep else round(1e9 / footage.fps)
-    pace = _Pace(service, footage, config.input.frames)
+    pace = _Pace(service, footage, config.input.frames, _left_off(service))
     for index, exposure in pace:
         stamp = Stamp(index, exposure.capture_ns, _released_ns(footage, exposure), period_ns)
         frame = StereoFrame(stamp, exposure.left, exposure.right)
@@ -83,15 +88,17 @@ class _Pace:
     In lock-step nothing is skipped and nothing waits for its time.
     """
 
-    def __init__(self, service: Service, footage: Footage, frames: int | None):
+    def __init__(
+        self, service: Service, footage: Footage, frames: int | None, left_off: Stamp | None
+    ):
         self._service, self._footage = service, footage
         self._frames = frames
         self._patient = service.config.lockstep or footage.live
+        self._index, self._began = _beginning(left_off, footage)
         self.last: int | None = None
         """Number of the last frame given."""
 
     def __iter__(self) -> _Pace:
-        self._index, self._began = 0, time.monotonic()
         return self
 
     def __next__(self) -> tuple[int, Exposure]:
@@ -113,6 +120,27 @@ class _Pace:
         if due > self._index + _BUFFERED:
             self._service.meter.skipped += due - self._index
             self._index = due
+
+
+def _left_off(service: Service) -> Stamp | None:
+    """The last frame that went through before the source died, where there is one to go on from."""
+    if not service.config.resume or not service.bus.wait_for_alive(topics.STEP.keeper, _KEEPER_S):
+        return None
+    return max(service.bus.last(topics.STEP), default=None)
+
+
+def _beginning(left_off: Stamp | None, footage: Footage) -> tuple[int, float]:
+    """The first frame's number, and when frame 0 was due by `time.monotonic`.
+
+    Recorded input goes on as if it had never stopped; a camera counts on.
+    """
+    now = time.monotonic()
+    if left_off is None:
+        return 0, now
+    if footage.live:
+        return left_off.frame + 1, now
+    began = now - (time.time_ns() - left_off.released_ns) / 1e9 - left_off.frame / footage.fps
+    return max(left_off.frame + 1, math.ceil((now - began) * footage.fps)), began
 
 
 def _released_ns(footage: Footage, exposure: Exposure) -> int:

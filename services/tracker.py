@@ -40,9 +40,13 @@ def run(service: Service, config: TrackerConfig) -> None:
     tracker = Tracker(rig, config.tracking, config.initialization)
     desk = SeedDesk(bus, tracker, rig, config.tracking.patience)
     grasps = GraspDesk(bus, rig)
-    for i, pixel in enumerate(config.seed):
-        desk.seed(Seed(str(i), pixel=pixel))
-    _warm_up(rig, config)
+    warm_up(rig, config)
+    given = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
+    if config.service.resume:
+        desk.resume(given)
+    else:
+        for seed in given:
+            desk.seed(seed)
     recorder = service.record(rig, config)
     if config.service.lockstep and not bus.wait_for_readers(topics.STEP):
         raise Stopped
@@ -63,7 +67,7 @@ def run(service: Service, config: TrackerConfig) -> None:
     desk.close()
 
 
-def _warm_up(rig: StereoRig, config: TrackerConfig) -> None:
+def warm_up(rig: StereoRig, config: TrackerConfig) -> None:
     """Compiles (or loads) the kernels on a drawn thread, so that the first frame is not late."""
     width, height = rig.image_size
     z = rig.focal * rig.baseline / (0.1 * width)
@@ -77,6 +81,8 @@ def _warm_up(rig: StereoRig, config: TrackerConfig) -> None:
             direction = (end - start) / np.linalg.norm(end - start)
             first, last = np.rint([start, end]).astype(int).tolist()
             cv2.line(view, first, last, direction.tolist(), 3)
+        view = cv2.GaussianBlur(view, (0, 0), 1.5)
+        view /= 1.001 * np.abs(view).max() + 1e-6
         # Fields from the wire are read-only, for which kernels are compiled anew.
         view.flags.writeable = False
         views.append(view)
@@ -85,3 +91,6 @@ def _warm_up(rig: StereoRig, config: TrackerConfig) -> None:
     tracker.seed(Seed(pixel=(float(u), float(v))))
     for frame in range(3):
         tracker.step(RidgeField(Stamp(frame, frame * 33_333_333, 0), views[0], views[1]))
+    nothing = np.zeros_like(views[0])
+    nothing.flags.writeable = False
+    tracker.step(RidgeField(Stamp(3, 100_000_000, 0), nothing, nothing))

@@ -87,6 +87,31 @@ def test_a_thread_that_vanishes_is_lost_in_time_and_found_again(rig: StereoRig) 
     assert np.linalg.norm(start - before[0]) < np.linalg.norm(start - before[1])
 
 
+@pytest.mark.parametrize("away_s", [0.1, 1.0, 2.0])
+def test_another_tracker_takes_a_thread_up(rig: StereoRig, away_s: float) -> None:
+    truths = [thread(i / FPS) for i in range(6 + round(away_s * FPS) + 12)]
+    seed = seed_on(rig, truths[0], "left")
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths[:6])]
+    last = follow(fields, rig, seed)[-1]
+    assert last.curve is not None
+    last = replace(last, curve=nurbs.reversed_curve(last.curve))
+    tracker = Tracker(rig)
+    tracker.resume(seed, last)
+    later = [paint(rig, [truths[i]], i) for i in range(len(truths) - 12, len(truths))]
+    blank = paint(rig, [], len(truths) - 13)
+    (waiting,) = tracker.step(blank).states
+    assert (waiting.status, waiting.stamp, waiting.curve) == (Status.LOST, blank.stamp, last.curve)
+    states = [tracker.step(field).states[0] for field in later]
+    assert {state.thread for state in states} == {"left"}
+    assert any("found again" in state.events for state in states)
+    assert states[-1].status is Status.TRACKING
+    assert error(states[-1], truths[-1]).rms < 0.1
+    assert states[-1].curve is not None
+    start, stop = nurbs.evaluate(states[-1].curve, np.array([0.0, 1.0]))
+    fixed = truths[0][0]  # where the thread is held, and the reversed curve ends
+    assert np.linalg.norm(stop - fixed) < np.linalg.norm(start - fixed)
+
+
 def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:
     truths = [thread(i / FPS) for i in range(30)]
     fields = []

@@ -17,7 +17,7 @@ from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.recovery import find_again
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
-from suturetrack.types import Energies, RidgeField, Seed, Stamp, Status, ThreadState
+from suturetrack.types import Energies, Nurbs, RidgeField, Seed, Stamp, Status, ThreadState
 
 _BETWEEN_ATTEMPTS_NS = 150_000_000
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
@@ -62,6 +62,18 @@ class Tracker:
         """
         self._threads[seed.thread] = _Thread(seed, self._config.patience)
 
+    def resume(self, seed: Seed, last: ThreadState) -> None:
+        """Takes a thread up where another tracker left it, lost until it is found again.
+
+        Args:
+            seed: from where it was looked for at first; names the thread.
+            last: its last state, with a curve.
+
+        It keeps the direction of the last curve, and counts as found if it has the same length.
+        """
+        last = replace(last, status=Status.LOST, events=())
+        self._threads[seed.thread] = _Thread(seed, 0, None, last)
+
     def forget(self, thread: str) -> None:
         """Drops the thread; unknown names are ignored."""
         self._threads.pop(thread, None)
@@ -74,10 +86,12 @@ class Tracker:
         initializations: dict[str, Initialization | InitializationError] = {}
         states = []
         for name, thread in self._threads.items():
-            if thread.follower is None:
-                state = self._find(name, thread, field, initializations)
-            else:
+            if thread.follower is not None:
                 state = self._follow(name, thread, thread.follower, field)
+            elif thread.last is not None and thread.last.curve is not None:
+                state = self._regain(name, thread, thread.last.curve, thread.last, field)
+            else:
+                state = self._find(name, thread, field, initializations)
             thread.last = state
             states.append(state)
         return TrackerStep(tuple(states), initializations)
@@ -96,19 +110,25 @@ class Tracker:
             return replace(state, events=("recovered", *state.events)) if was_lost else state
         if not was_lost:
             state = replace(state, events=("lost", *state.events))
+        again = self._look_again(name, thread, follower.last_good, follower.known_length, field)
+        return again or state
+
+    def _regain(
+        self, name: str, thread: _Thread, curve: Nurbs, last: ThreadState, field: RidgeField
+    ) -> ThreadState:
+        again = self._look_again(name, thread, curve, last.length, field)
+        return again or replace(last, stamp=field.stamp)
+
+    def _look_again(
+        self, name: str, thread: _Thread, last: Nurbs, known_length: float, field: RidgeField
+    ) -> ThreadState | None:
+        """The state of a lost thread that is found again, every now and then looked for."""
         if field.stamp.capture_ns < thread.wait_ns:
-            return state
+            return None
         thread.wait_ns = field.stamp.capture_ns + _BETWEEN_ATTEMPTS_NS
-        curve = find_again(
-            follower.last_good,
-            follower.known_length,
-            thread.seed,
-            field,
-            self._rig,
-            self._initialization,
-        )
+        curve = find_again(last, known_length, thread.seed, field, self._rig, self._initialization)
         if curve is None:
-            return state
+            return None
         thread.follower = Follower(curve, field, self._rig, self._config)
         state = thread.follower.step(field, name)
         return replace(state, events=("found again", *state.events))
