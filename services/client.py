@@ -21,10 +21,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Literal, Self, TypeVar
+
+import numpy as np
 
 from services import topics
-from services.bus import DEPTH, Bus, NoAnswer
+from services.bus import DEPTH, Bus, NoAnswer, Reader
 from services.checks import check, check_name
 from services.freshness import Freshness
 from services.inbox import Inbox
@@ -33,7 +35,9 @@ from services.topics import Question
 from services.zenoh_transport import ZenohTransport, load_config, local_config
 from suturetrack.camera import StereoRig
 from suturetrack.grasping import AWAY_FROM_CAMERA, GraspPoint
-from suturetrack.types import Grasp, InputError, Seed, ThreadState
+from suturetrack.initialization import InitializationError
+from suturetrack.snapping import point_of_right_pixel
+from suturetrack.types import Grasp, InputError, RidgeField, Seed, ThreadState
 
 Q = TypeVar("Q")
 A = TypeVar("A")
@@ -58,7 +62,7 @@ class Refused(InputError):
         super().__init__(reason)
         self.reason = reason
         self.candidates = candidates
-        """Of a seed on no thread: pixels (u, v) of the raw left image near it that look like thread."""
+        """Of a seed on no thread: pixels (u, v) of the same raw image near it that look like thread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +119,7 @@ class Client:
         self._latest: dict[str, Seen] = {}
         self._listeners: dict[Inbox[Seen], str | None] = {}
         self._given_up = 0
+        self._fields: Reader[RidgeField] | None = None
         threading.Thread(target=self._listen, name="states", daemon=True).start()
 
     @property
@@ -176,6 +181,7 @@ class Client:
         self,
         pixel: Pixel | None = None,
         *,
+        view: Literal["left", "right"] = "left",
         point: Point | None = None,
         thread: str = "0",
         timeout: float = 10.0,
@@ -183,7 +189,8 @@ class Client:
         """Has a thread looked for, and waits for what is found.
 
         Args:
-            pixel: (u, v) in the raw left image.
+            pixel: (u, v) in a raw image.
+            view: in which image.
             point: (x, y, z) instead of a pixel, m.
             thread: name; a thread that has it is looked for anew.
             timeout: seconds.
@@ -193,6 +200,8 @@ class Client:
             Unavailable: nobody answers.
             InputError: not exactly one place, or a bad name.
         """
+        if view == "right" and pixel is not None and point is None:
+            pixel, point = None, self._point_of_right(pixel)
         reply = self._ask(topics.SEED, Seed(thread, pixel, point), timeout)
         if not reply.accepted:
             raise Refused(reply.reason, reply.candidates)
@@ -247,6 +256,23 @@ class Client:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+    def _point_of_right(self, pixel: Pixel) -> Point:
+        """The point in space, m, that a pixel of the raw right image means."""
+        rig = self.calibration()
+        with self._lock:
+            self._fields = self._fields or self.bus.newest(topics.FIELD)
+        field = self._fields.get(_ARRIVAL_S)
+        if field is None:
+            raise Unavailable("no ridge fields come in which to look for the right pixel")
+        try:
+            at = rig.rectify_pixels(np.asarray(pixel, float), right=True)
+            point = point_of_right_pixel(field, rig, at)
+        except InitializationError as error:
+            near = rig.raw_pixels(error.candidates, right=True)
+            raise Refused(error.reason, tuple((float(u), float(v)) for u, v in near)) from error
+        x, y, z = (point * rig.metres_per_unit).tolist()
+        return x, y, z
 
     def _ask(self, question: Question[Q, A], content: Q, timeout: float) -> A:
         try:

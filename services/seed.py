@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -17,7 +17,9 @@ class SeedConfig:
     """Tells a running tracker where a thread is, and waits for what it finds."""
 
     pixel: Annotated[tuple[float, float] | None, tyro.conf.Positional] = None
-    """U V of a pixel on the thread in the raw left image."""
+    """U V of a pixel on the thread in a raw image."""
+    view: Literal["left", "right"] = "left"
+    """In which image the pixel is."""
     point: tuple[float, float, float] | None = None
     """X Y Z of a point on the thread instead, in metres, in the rectified left camera."""
     thread: str = "0"
@@ -36,7 +38,9 @@ def run(config: SeedConfig) -> None:
     """
     with connect(config.rig, config.zenoh) as client:
         try:
-            found = client.seed(config.pixel, point=config.point, thread=config.thread)
+            found = client.seed(
+                config.pixel, view=config.view, point=config.point, thread=config.thread
+            )
         except Refused as refusal:
             near = ", ".join(f"{u:.0f} {v:.0f}" for u, v in refusal.candidates)
             hint = f"; pixels that look like thread: {near}" if near else ""

@@ -6,14 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import InitializationConfig
+from suturetrack.initialization import InitializationConfig, InitializationError, initialize
 from suturetrack.initialization.growth import nearest_segment
 from suturetrack.initialization.segments import find_ridges
-from suturetrack.types import Float32, Float64, RidgeField
+from suturetrack.types import Float32, Float64, Nurbs, RidgeField, Seed
 
+_SAMPLES = 400
 _ROWS_PX = 1.0
 """How far apart the rows of two ridge points of one place may be."""
+
+_SAME_PX = 3.0
+"""How near to a curve a ridge is that belongs to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,3 +99,71 @@ def snap_point(
     if len(distance) == 0 or not distance.min() <= radius:
         return None
     return places[np.argmin(distance)]
+
+
+def point_of_right_pixel(
+    field: RidgeField,
+    rig: StereoRig,
+    pixel: Float64,
+    config: InitializationConfig = InitializationConfig(),
+) -> Float64:
+    """(3,) the point on the thread that a click in the right view means.
+
+    A row of the left view crosses several ridges: each is tried, and the thread counts that passes
+    through the click in the right view.
+
+    Args:
+        field: both views.
+        rig: the cameras.
+        pixel: (2,) rectified right view.
+        config: of the initialisation that the seed is for.
+
+    Raises:
+        InitializationError: there is no ridge at the pixel (its candidates are in the right view), or
+            the left view shows no thread that would appear there.
+    """
+    found, candidates = snap_pixel(field.right, pixel, config)
+    if found is None:
+        raise InitializationError("the right view shows no thread there", candidates)
+    best, most = None, -1.0
+    curves: list[Nurbs] = []
+    for left in _on_row(field, rig, found.pixel, config):
+        if any(_distance_px(rig.project(_dense(c))[0], left)[1] < _SAME_PX for c in curves):
+            continue
+        u, v = (float(x) for x in rig.raw_pixels(left))
+        try:
+            start = initialize(field, rig, Seed(pixel=(u, v)), config)
+        except InitializationError:
+            continue
+        curves.append(start.curve)
+        points = _dense(start.curve)
+        index, distance = _distance_px(rig.project(points)[1], found.pixel)
+        if distance < _SAME_PX and start.confidence > most:
+            best, most = points[index], start.confidence
+    if best is None:
+        raise InitializationError("the left view shows no thread that matches", np.empty((0, 2)))
+    return best
+
+
+def _on_row(
+    field: RidgeField, rig: StereoRig, right: Float64, config: InitializationConfig
+) -> list[Float64]:
+    """Where ridges of the left view cross the row of a right pixel, nearest disparity first."""
+    farthest = right[0] + rig.left.projection[0, 2] - rig.right.projection[0, 2]
+    places = []
+    for segment in find_ridges(field.left, config).segments:
+        ahead = segment[segment[:, 0] > farthest]
+        row = abs(ahead[:, 1] - right[1])
+        if len(row) and row.min() <= _ROWS_PX:
+            places.append(ahead[np.argmin(row)])
+    return sorted(places, key=lambda place: float(place[0]))
+
+
+def _dense(curve: Nurbs) -> Float64:
+    return nurbs.evaluate(curve, np.linspace(0, 1, _SAMPLES))
+
+
+def _distance_px(line: Float64, pixel: Float64) -> tuple[int, float]:
+    """Index of the sample nearest to a pixel, and its distance."""
+    distance = np.linalg.norm(line - pixel, axis=1)
+    return int(np.argmin(distance)), float(distance.min())

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import InitializationConfig
-from suturetrack.snapping import snap_area, snap_pixel, snap_point
+from suturetrack.initialization import InitializationConfig, InitializationError
+from suturetrack.snapping import point_of_right_pixel, snap_area, snap_pixel, snap_point
 from suturetrack.types import RidgeField
 from tests.painting import paint, thread
 
@@ -75,3 +75,26 @@ def test_a_tool_tip_finds_the_thread_within_its_radius(
         assert np.linalg.norm(found - tip) <= 8.0
     assert snap_point(field, rig, line[300] + [0.0, 0.0, 30.0], 8.0) is None
     assert snap_point(field, rig, np.array([0.0, 0.0, -5.0]), 8.0) is None
+
+
+def test_a_click_in_the_right_view_means_the_thread_that_shows_there(rig: StereoRig) -> None:
+    """Two threads cross the row of the click in the left view."""
+    lines = [thread(0.3), thread(1.1, depth=170.0) + np.array([25.0, 2.0, 0.0])]
+    field = paint(rig, lines, 0)
+    for line in lines:
+        for at in (150, 420):
+            pixel = rig.project(line)[1][at]
+            point = point_of_right_pixel(field, rig, pixel + np.array([1.0, 2.0]), CONFIG)
+            left, right = rig.project(point)
+            assert off(rig.project(line)[1], right) < 3.0
+            assert off(rig.project(line)[0], left) < 3.0
+    with pytest.raises(InitializationError, match="no thread there"):
+        point_of_right_pixel(field, rig, np.array([620.0, 20.0]), CONFIG)
+
+
+def test_a_thread_in_the_right_view_alone_is_refused(rig: StereoRig) -> None:
+    line = thread(0.3)
+    both, none = paint(rig, [line], 0), paint(rig, [], 1)
+    field = RidgeField(both.stamp, none.left, both.right)
+    with pytest.raises(InitializationError, match="the left view shows no thread"):
+        point_of_right_pixel(field, rig, rig.project(line)[1][300], CONFIG)
