@@ -179,3 +179,15 @@ def test_a_video_that_is_cut_off_ends_early(tmp_path: Path, calibration: Path) -
     seen = [footage.read(i) is not None for i in range(COUNT)]
     assert seen[0]
     assert not seen[-1]
+
+
+def test_a_loop_goes_there_and_back_in_rising_time(tmp_path: Path, calibration: Path) -> None:
+    write_folder(tmp_path / "pairs")
+    options = {"source": str(tmp_path / "pairs"), "calibration": calibration}
+    footage, _ = open_input(InputConfig(**options, loop=3))  # type: ignore[arg-type]
+    exposures = [footage.read(i) for i in (0, 1, 2, 3, 4, 5, 4001)]
+    assert all(e is not None for e in exposures)
+    assert [told(e.left)[0] for e in exposures if e] == [0, 1, 2, 1, 0, 1, 1]
+    assert [e.capture_ns for e in exposures if e][-1] == round(4001 * 1e9 / 30)
+    with pytest.raises(InputError, match="--loop 7"):
+        open_input(InputConfig(**options, loop=7))  # type: ignore[arg-type]

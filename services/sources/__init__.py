@@ -9,6 +9,7 @@ from typing import Literal
 from services.sources.camera import CameraFootage, is_device
 from services.sources.folder import FolderFootage
 from services.sources.footage import Footage
+from services.sources.loop import LoopFootage
 from services.sources.stage import StageFootage
 from services.sources.video import VideoFootage
 from suturetrack.calibration import load_calibration
@@ -34,6 +35,8 @@ class InputConfig:
     """Frames a second of folders and of the bench top; videos know theirs."""
     frames: int | None = None
     """Stop after so many frames."""
+    loop: int | None = None
+    """Show the first so many frames there and back again from memory, without end; for long tests."""
     scene_seed: int = 0
     """Which variant of the bench top's scene."""
     scene_rig: str = "bench"
@@ -52,6 +55,11 @@ def open_input(config: InputConfig) -> tuple[Footage, StereoRig]:
         raise InputError(f"fps {config.fps:g}: use frames per second, above 0 and up to 1000")
     if config.frames is not None and config.frames < 1:
         raise InputError(f"frames {config.frames}: use 1 or more")
+    footage, rig = _open(config)
+    return (footage if config.loop is None else LoopFootage(footage, config.loop)), rig
+
+
+def _open(config: InputConfig) -> tuple[Footage, StereoRig]:
     if config.source.startswith(STAGE):
         return _open_stage(config)
     if config.calibration is None:
