@@ -10,6 +10,7 @@ import numpy as np
 import tyro
 
 from services import topics
+from services.adaptation import Adaptation
 from services.bus import Bus
 from services.service import Service, ServiceConfig, Stopped
 from services.wire import scaled
@@ -50,6 +51,8 @@ def run(service: Service, config: SegmenterConfig) -> None:
     bus.make_room(warm_up(rig, config))
     recorder = service.record(rig, config)
     seedings = bus.every(topics.SEEDING)
+    states = bus.every(topics.STATE)
+    adaptation = Adaptation(segmenter, rig, states, lockstep=config.service.lockstep)
     seeds = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
     held = _Held(bus, rig) if config.service.resume else None
     if held is not None:
@@ -72,6 +75,7 @@ def run(service: Service, config: SegmenterConfig) -> None:
             continue
         bus.publish(topics.FIELD, ridges)
         recorder.field(ridges, service.finished(frame.stamp))
+        adaptation.step(frame)
 
 
 class _Held:

@@ -94,6 +94,11 @@ class Segmenter:
         self._views = _View(height, width, config), _View(height, width, config)
         self._steps = 0
 
+    @property
+    def threads(self) -> tuple[str, ...]:
+        """Names of the threads that were learned."""
+        return tuple(self._threads)
+
     def step(self, frame: StereoFrame) -> RidgeField:
         """The field of `frame`, in rectified pixels.
 

@@ -1,0 +1,136 @@
+"""What the tracker holds teaches the segmenter: when, from which states, and the same every time."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services import topics
+from services.adaptation import Adaptation
+from services.bus import Bus
+from services.memory_transport import Hub
+from services.sources import InputConfig
+from services.wire import scaled
+from suturetrack import nurbs
+from suturetrack.segmentation import Segmenter
+from suturetrack.stage import Scene, open_scene
+from suturetrack.stage.appearance import Picture
+from suturetrack.types import (
+    Energies,
+    Float64,
+    Nurbs,
+    Seed,
+    Stamp,
+    Status,
+    StereoFrame,
+    ThreadState,
+)
+from tests.test_tiny import bits, play
+
+
+@pytest.fixture(scope="module")
+def scenes() -> tuple[Scene, Scene]:
+    """The same thread on paper and on tissue."""
+    backgrounds = ("marbled", "tissue")
+    a, b = (open_scene("figure8-107", 22, picture=Picture("violet", b)) for b in backgrounds)
+    return a, b
+
+
+def state_of(curve: Nurbs, stamp: Stamp, status: Status = Status.TRACKING) -> ThreadState:
+    nothing: Float64 = np.zeros(64)
+    return ThreadState(stamp, "0", status, curve, 100.0, Energies(), nothing, np.ones(64, bool))
+
+
+class Desk:
+    """A segmenter that learned a thread on paper and then sees it on tissue, with its adaptation."""
+
+    def __init__(self, scenes: tuple[Scene, Scene]) -> None:
+        hub, paper = Hub(), scenes[0]
+        self.bus, reader = (
+            Bus(hub.connect(), "rig", "tracker"),
+            Bus(hub.connect(), "rig", "segmenter"),
+        )
+        self.rig = paper.rig
+        self.segmenter = Segmenter(self.rig)
+        self.images = scenes[1].render(0)
+        seed = Seed(pixel=paper.seed_pixel())
+        self.segmenter.learn(StereoFrame(Stamp(0, 0, 0), *paper.render(0)), seed)
+        states = reader.every(topics.STATE)
+        self.adaptation = Adaptation(self.segmenter, self.rig, states, lockstep=True)
+        truth = paper.truth(0)[0]
+        knots = nurbs.clamped_knots(np.linspace(0, 1, 40)[1:-1], 3)
+        s = np.linspace(0, 1, len(truth.points))
+        self.curve = nurbs.fit(truth.points, s, knots, 3)
+        self.fields: list[bytes] = []
+        """Of every frame; the pictures are all the same."""
+
+    def frame(self, index: int, *states: ThreadState) -> None:
+        stamp = Stamp(index, index * 250_000_000, 0)
+        frame = StereoFrame(stamp, *self.images)
+        self.fields.append(self.segmenter.step(frame).left.tobytes())
+        for state in states:
+            message = scaled(replace(state, stamp=stamp), self.rig.metres_per_unit)
+            self.bus.publish(topics.STATE, message)
+        self.adaptation.step(frame)
+
+
+def test_the_states_of_a_frame_teach_a_second_later(scenes: tuple[Scene, Scene]) -> None:
+    desk = Desk(scenes)
+    for index in range(11):
+        desk.frame(index, state_of(desk.curve, Stamp(index, 0, 0)))
+    changed = [a != b for a, b in itertools.pairwise(desk.fields)]
+    assert changed == [index in (4, 8) for index in range(10)]
+
+
+@pytest.mark.parametrize("status", [Status.OCCLUDED, Status.LOST])
+def test_a_curve_that_is_not_held_teaches_nothing(
+    scenes: tuple[Scene, Scene], status: Status
+) -> None:
+    desk = Desk(scenes)
+    for index in range(7):
+        desk.frame(index, state_of(desk.curve, Stamp(index, 0, 0), status))
+    assert len(set(desk.fields)) == 1
+
+
+def test_states_of_other_frames_and_threads_teach_nothing(scenes: tuple[Scene, Scene]) -> None:
+    desk = Desk(scenes)
+    for index in range(7):
+        stranger = replace(state_of(desk.curve, Stamp(index, 0, 0)), thread="1")
+        desk.frame(index, *([stranger] if index % 4 == 0 else []))
+    assert len(set(desk.fields)) == 1
+
+
+def test_lock_step_waits_for_states_on_their_way(scenes: tuple[Scene, Scene]) -> None:
+    desks = Desk(scenes), Desk(scenes)
+    for desk, is_late in zip(desks, (False, True), strict=True):
+        first = state_of(desk.curve, Stamp(0, 0, 0))
+        desk.frame(0, *([] if is_late else [first]))
+        late = scaled(first, desk.rig.metres_per_unit)
+        timer = threading.Timer(0.3, desk.bus.publish, (topics.STATE, late))
+        if is_late:
+            timer.start()
+        desk.frame(4)
+        desk.frame(5)
+    assert desks[0].fields == desks[1].fields
+    assert desks[0].fields[1] != desks[0].fields[2]
+
+
+def test_lock_step_adapts_the_same_twice_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    adapted = []
+    adapt = Segmenter.adapt
+
+    def counted(segmenter: Segmenter, frame: StereoFrame, pixels: Float64, thread: str) -> None:
+        adapted.append(frame.stamp.frame)
+        adapt(segmenter, frame, pixels, thread)
+
+    monkeypatch.setattr(Segmenter, "adapt", counted)
+    stage = InputConfig("stage:figure8-107", fps=8.0, frames=20)
+    seed = (open_scene("figure8-107").seed_pixel(0),)
+    runs = [play(seed, stage=stage) for _ in range(2)]
+    states = [[bits(state) for state in outcome.states] for outcome, _ in runs]
+    assert adapted == 2 * [0, 8]
+    assert states[0] == states[1]
