@@ -19,13 +19,16 @@ class PaperConfig:
     samples_per_control_point: int = 5
     """Points of the curve that forces act on."""
     search_px: float = 6.0
-    """How far active search looks to each side."""
+    """How far active search looks to each side, and along the curve at its ends."""
     flat_px: float = 0.1
     """A force below this leaves the point to active search."""
+    flat_slope: float = 0.1
+    """Slope of the field along the tangent at an end below which the end is left to active search, per
+    px, as a part of the cut-off of eq. (7)."""
     largest_step_px: float = 2.0
     """Longest step of a point in one update."""
     spacing_px: tuple[float, float] = (10.0, 26.0)
-    """Distance of neighbouring control points below which one is pruned, above which one is inserted."""
+    """Range of the distances of neighbouring control points: beyond it they are spaced evenly again."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import spline
-from suturetrack.kernels.spline import Int64
 from suturetrack.nurbs import clamped_knots, curve_from, insert_knot
 from suturetrack.tracking.sampling import Samples, View, distinct, values_at, views
 from suturetrack.types import Float64, Nurbs
@@ -35,49 +34,6 @@ def rearrange(curve: Nurbs, rig: StereoRig) -> tuple[Nurbs, int, int]:
     for i in sparse:
         curve = insert_knot(curve, float(edges[i] + edges[i + 1]) / 2)
     return curve, len(sparse), len(crowded)
-
-
-def respace(
-    curve: Nurbs, rig: StereoRig, spacing_px: tuple[float, float]
-) -> tuple[Nurbs, int, int]:
-    """The paper's rule: prunes control points that are too close and inserts where the gap is large.
-
-    Returns what `rearrange` does; `spacing_px` is the range of the gaps.
-    """
-    left, right = rig.project(curve.control_points)
-    gaps = np.linalg.norm(np.diff((left + right) / 2, axis=0), axis=1)
-    close = [int(i) for i in np.flatnonzero(gaps[1:-2] + gaps[2:-1] < 2 * spacing_px[0])]
-    close = [i for n, i in enumerate(close) if n == 0 or close[n - 1] < i - 1]
-    near = [curve.knots[i + 4] for i in close if i + 4 < len(curve.knots) - 4]
-    near += _crowded_ends(curve.knots, gaps, spacing_px[0])
-    wide = _midpoints(curve.knots, np.flatnonzero(gaps > spacing_px[1]))
-    for s in wide:
-        curve = insert_knot(curve, s)
-    if near:
-        interior = distinct(curve.knots)[1:-1]
-        curve = refit(curve, interior[~np.isin(interior, near)])
-    return curve, len(wide), len(near)
-
-
-def _crowded_ends(knots: Float64, gaps: Float64, least_px: float) -> list[float]:
-    """Knots beside an end that its forces have pushed onto its neighbour.
-
-    The end moves alone (Section VI-D). Were it to pass its neighbour, the tangent there would turn
-    round, and the end would run back along the thread. Clamped knots make the last gap a third of
-    the others.
-    """
-    return [
-        float(knots[knot])
-        for knot, gap in ((4, gaps[0]), (-5, gaps[-1]))
-        if gap < least_px / 4 and 0 < knots[knot] < 1
-    ]
-
-
-def _midpoints(knots: Float64, gaps: Int64) -> list[float]:
-    """Parameters midway between the control points on both sides of each gap, clear of knots."""
-    reach = np.stack([knots[gaps + 2 + i] for i in range(2)])
-    middle = reach.mean(axis=0)
-    return [float(s) for s in np.unique(middle) if np.abs(knots - s).min() > 1e-6]
 
 
 def refit(curve: Nurbs, interior: Float64) -> Nurbs:

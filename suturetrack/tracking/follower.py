@@ -11,12 +11,13 @@ from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.tracking import gauss_newton, paper
 from suturetrack.tracking.config import TrackingConfig
-from suturetrack.tracking.control_points import rearrange, respace
+from suturetrack.tracking.control_points import rearrange
 from suturetrack.tracking.ends import EndWatch, doubled_ends, find_end
 from suturetrack.tracking.energies import energies
 from suturetrack.tracking.motion import Motion
 from suturetrack.tracking.reliability import Doubt, Evidence, judge
 from suturetrack.tracking.sampling import Samples, distinct, length_of, values_at, views
+from suturetrack.tracking.spacing import respace
 from suturetrack.types import Nurbs, RidgeField, Status, ThreadState
 
 _NS = 1e-9

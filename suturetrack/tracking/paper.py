@@ -1,8 +1,19 @@
-"""The method of the paper, eqs. (4)-(16), with the signs mended.
+"""The method of the paper, eqs. (4)-(16), mended where it does not work as printed.
 
-As printed, eq. (5) climbs the energy for b > 0, and eq. (9) drives the far end the wrong way: the
-force along the tangent does not depend on the tangent's sign, so eq. (8) holds at both ends. Eq. (13)
-is solved by its normal rows alone: a tangential offset that nobody measured is no zero.
+- Eq. (5) climbs the energy for b > 0: a step is +b grad |V|.
+- Eq. (9) drives the far end the wrong way: the force along the tangent does not depend on the
+  tangent's sign, so eq. (8) holds at both ends.
+- Eq. (10) mixes the tangents of space and image; both are the image's here. At an end it is that of a
+  chord: the last control points come close, and their direction is noise.
+- Eq. (8) has dead zones: a thread drawn out faster than its end follows leaves the end on the plateau
+  of |V|, where there is no slope. The paper searches actively where the gradient is small; here the
+  ends are searched for as well, for the place where the response falls to the cut-off.
+- Eq. (13) is solved by its normal rows alone inside the curve: a tangential offset that nobody measured
+  is no zero, and would hold the depth back. At an end both offsets are measured in both images, and all
+  four rows count; along the tangent alone an end could not mend its depth.
+- The ends move alone (Section VI-D), which crowds the last control points or pulls them apart until the
+  curve turns round on itself, unseen by evenly spaced parameters. So control points out of the
+  paper's range of distances are spaced evenly again, over knots that follow the arc length.
 """
 
 from __future__ import annotations
@@ -18,9 +29,11 @@ from suturetrack.types import Float32, Float64, Nurbs, RidgeField
 
 _DIFFERENCE_PX = 1.0
 _SEARCH_STEP_PX = 1.0
-# An end's tangent is that of the chord over so many samples: the last two control points come close,
-# and their direction is then noise, above all in depth.
+# Samples between the ends of the chord at an end.
 _CHORD = 6
+# What active search finds has to respond so much more than the place where the point is.
+_CLEARER = 0.1
+_DAMPING = 1e-3
 
 
 def fit(
@@ -70,8 +83,10 @@ def _point_offsets(
     images = field.left, field.right
     normal = [_normal_offsets(i, v, config) for i, v in zip(images, both, strict=True)]
     step = _deproject_normals(both, normal, first)
-    ends = [_end_offsets(i, v, c, config) for i, v, c in zip(images, both, cutoffs, strict=True)]
-    return step + _deproject_ends(both, ends, first)
+    along = [_end_offsets(i, v, c, config) for i, v, c in zip(images, both, cutoffs, strict=True)]
+    for end in (0, -1):
+        step[end] = _deproject_end(both, end, normal, along)
+    return step
 
 
 def _normal_offsets(image: Float32, view: View, config: PaperConfig) -> Float64:
@@ -84,23 +99,49 @@ def _normal_offsets(image: Float32, view: View, config: PaperConfig) -> Float64:
     grid = _SEARCH_STEP_PX * np.arange(-reach, reach + 1)
     profiles = search.normal_profiles(image, view.pixels, view.tangents, grid)
     best = np.argmax(profiles - 1e-3 * np.abs(grid), axis=1)
-    flat = (np.abs(force) < config.flat_px) & (profiles.max(axis=1) > response + config.flat_px)
+    flat = (np.abs(force) < config.flat_px) & (profiles.max(axis=1) > response + _CLEARER)
     searched = np.clip(grid[best], -config.largest_step_px, config.largest_step_px)
     force = np.clip(force, -config.largest_step_px, config.largest_step_px)
     return np.where(flat, searched, force)
 
 
-def _end_offsets(
-    image: Float32, view: View, cutoff: float, config: PaperConfig
-) -> tuple[float, float]:
-    """px along the tangents at both ends: eqs. (8) and (10)."""
+def _end_offsets(image: Float32, view: View, cutoff: float, config: PaperConfig) -> Float64:
+    """(2,) px along the tangents at both ends: eqs. (8) and (10); where |V| is flat, active search."""
     ends, tangents = view.pixels[[0, -1]], view.tangents[[0, -1]]
     excess = search.responses(image, ends, tangents) - cutoff
     slope = _slope(image, ends, tangents)
-    force = np.clip(
-        -2 * config.end_gain * slope * excess, -config.largest_step_px, config.largest_step_px
-    )
-    return float(force[0]), float(force[1])
+    force = -2 * config.end_gain * slope * excess
+    for end, outward in ((0, -1.0), (-1, 1.0)):
+        if abs(slope[end]) < config.flat_slope * cutoff:
+            force[end] = outward * _search_end(image, view, end, cutoff, config.search_px)
+    return np.clip(force, -config.largest_step_px, config.largest_step_px)
+
+
+def _search_end(image: Float32, view: View, end: int, cutoff: float, reach_px: float) -> float:
+    """px outward from the end 0 or -1 to where the response falls to the cut-off; 0 where nothing is seen."""
+    x = np.arange(-reach_px, reach_px + _SEARCH_STEP_PX / 2, _SEARCH_STEP_PX)
+    shown = search.responses(image, *_along_end(view, end, x))
+    above = shown > cutoff
+    if above.all():
+        return reach_px
+    falls = np.flatnonzero(above[:-1] & ~above[1:])
+    if not len(falls):
+        return 0.0
+    share = (shown[falls] - cutoff) / (shown[falls] - shown[falls + 1])
+    crossings = x[falls] + _SEARCH_STEP_PX * share
+    return float(crossings[np.argmin(np.abs(crossings))])
+
+
+def _along_end(view: View, end: int, x: Float64) -> tuple[Float64, Float64]:
+    """(k, 2) pixels and unit tangents x px outward from an end: on the curve, then straight on."""
+    order = slice(None) if end == 0 else slice(None, None, -1)
+    pixels, tangents = view.pixels[order], view.tangents[order]
+    inward = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1))]
+    on_curve = [np.interp(-x, inward, column) for column in np.c_[pixels, tangents].T]
+    places, directions = np.stack(on_curve[:2], axis=1), np.stack(on_curve[2:], axis=1)
+    outward = tangents[0] if end else -tangents[0]
+    places += np.maximum(x, 0.0)[:, None] * outward
+    return places, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def _slope(image: Float32, pixels: Float64, directions: Float64) -> Float64:
@@ -117,23 +158,22 @@ def _deproject_normals(both: tuple[View, View], offsets: list[Float64], first: F
     rows = np.stack([((v.normals[:, None, :] @ v.jacobian) @ plane)[:, 0, :] for v in both], axis=1)
     square = rows.transpose(0, 2, 1) @ rows
     scale = np.trace(square, axis1=1, axis2=2)
-    square = square + 1e-3 * scale[:, None, None] * np.eye(2)
+    square = square + _DAMPING * scale[:, None, None] * np.eye(2)
     right = rows.transpose(0, 2, 1) @ np.stack(offsets, axis=1)[:, :, None]
     return (plane @ np.linalg.solve(square, right))[:, :, 0]
 
 
-def _deproject_ends(
-    both: tuple[View, View], offsets: list[tuple[float, float]], first: Float64
+def _deproject_end(
+    both: tuple[View, View], end: int, normal: list[Float64], along: list[Float64]
 ) -> Float64:
-    """(k, 3) alpha t of eq. (13) at the two ends, zero elsewhere."""
-    step = np.zeros_like(first)
-    for column, end in enumerate((0, -1)):
-        tangent = first[end] / max(float(np.linalg.norm(first[end])), 1e-12)
-        along = np.array([v.tangents[end] @ v.jacobian[end] @ tangent for v in both])
-        measured = np.array([offset[column] for offset in offsets])
-        # An end that points at the camera would be thrown far for a small offset in the image.
-        least = 0.1 * sum(float(np.sum(v.jacobian[end] ** 2)) for v in both)
-        step[end] = tangent * (along @ measured) / max(float(along @ along), least)
+    """(3,) step of an end: all four rows of eq. (13), for the images measure both directions there."""
+    rows = np.concatenate(
+        [np.stack([v.normals[end], v.tangents[end]]) @ v.jacobian[end] for v in both]
+    )
+    right = np.array([o[end] for pair in zip(normal, along, strict=True) for o in pair])
+    square = rows.T @ rows
+    square += _DAMPING * np.trace(square) * np.eye(3)
+    step: Float64 = np.linalg.solve(square, rows.T @ right)
     return step
 
 
