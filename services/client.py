@@ -201,7 +201,8 @@ class Client:
             InputError: not exactly one place, or a bad name.
         """
         if view == "right" and pixel is not None and point is None:
-            pixel, point = None, self._point_of_right(pixel)
+            point = self._point_of_right(pixel)
+            pixel = None
         reply = self._ask(topics.SEED, Seed(thread, pixel, point), timeout)
         if not reply.accepted:
             raise Refused(reply.reason, reply.candidates)
