@@ -9,7 +9,8 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from services.bench import initialization, latency, report, segmentation, tracking
+from services.bench import faults, initialization, latency, report, segmentation, tracking
+from services.bench.faults import FaultsBench
 from services.bench.initialization import InitializationBench
 from services.bench.latency import LatencyBench
 from services.bench.report import Plot
@@ -32,6 +33,10 @@ _PLOTS = {
     ),
     "segmentation": (Plot("pair_ms", "filter", logarithmic=True), Plot("f1", "filter")),
     "latency": (Plot("p50_ms", "process"), Plot("p99_ms", "process")),
+    "faults": (
+        Plot("stale_max_ms", "fault", reference="limit_ms"),
+        Plot("back_max_s", "fault", logarithmic=True),
+    ),
 }
 
 
@@ -44,7 +49,8 @@ class BenchConfig:
         Annotated[TrackingBench, tyro.conf.subcommand("tracking")]
         | Annotated[InitializationBench, tyro.conf.subcommand("initialization")]
         | Annotated[SegmentationBench, tyro.conf.subcommand("segmentation")]
-        | Annotated[LatencyBench, tyro.conf.subcommand("latency")],
+        | Annotated[LatencyBench, tyro.conf.subcommand("latency")]
+        | Annotated[FaultsBench, tyro.conf.subcommand("faults")],
         tyro.conf.arg(name=""),
     ]
     """The benchmark."""
@@ -67,6 +73,8 @@ def run(config: BenchConfig) -> None:
             name, table = "segmentation", [*segmentation.run(config.what, console)]
         case LatencyBench():
             name, table = "latency", [*latency.run(config.what, console)]
+        case FaultsBench():
+            name, table = "faults", [*faults.run(config.what, console)]
     if config.json is not None:
         report.write_json(config.json, {name: table})
     if config.page is not None:
