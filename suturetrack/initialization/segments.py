@@ -7,11 +7,15 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 from scipy.spatial import cKDTree
 
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.kernels import crest
 from suturetrack.types import Float32, Float64
+
+Int64 = NDArray[np.int64]
 
 ARM = 14
 """Points of a segment that tell where it is heading."""
@@ -19,8 +23,13 @@ _SHORTEST = 4
 """Points; what is shorter says nothing about direction."""
 _NEAR_PX = 6.0
 """How near an end comes to the side of the segment that it runs into."""
-_GLANCING = 0.7
+_GLANCING = 0.6
 """Cosine of the angle below which an end runs into the side of a segment rather than along it."""
+_HEADING = 6
+"""Points at an end that tell where it runs into another segment."""
+_KINK_REACH = 5
+_KINK = 0.6
+"""Cosine of the turn, over `_KINK_REACH` points to both sides, from which a segment has a kink."""
 _NOISE_QUANTILE = 0.9
 _ABOVE_NOISE = 2.0
 
@@ -66,37 +75,73 @@ def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
 
 
 def split_at_touches(segments: tuple[Float64, ...]) -> tuple[Float64, ...]:
-    """Cuts segments where the end of another runs into them at a small angle, so that what two
-    strands share becomes a segment of its own."""
+    """Cuts segments at junctions that the crest lines do not show as such: where the end of another
+    runs into their side at a small angle, so that what two strands share becomes a segment of its
+    own, and where they turn from one strand into another."""
     if not segments:
         return ()
-    points = np.concatenate(segments)
-    owner = np.repeat(np.arange(len(segments)), [len(s) for s in segments])
-    index = np.concatenate([np.arange(len(s)) for s in segments])
-    tree = cKDTree(points)
+    near = _Neighbourhood(segments)
     cuts: dict[int, set[int]] = {}
     for k, segment in enumerate(segments):
-        for arm, at in ((segment[:ARM], 0), (segment[::-1][:ARM], len(segment) - 1)):
-            heading = arm[0] - arm[-1]
-            heading = heading / max(float(np.linalg.norm(heading)), 1e-9)
-            near = np.array(tree.query_ball_point(arm[0] + 2 * heading, _NEAR_PX), dtype=int)
-            apart = (owner[near] != k) | (abs(index[near] - at) > 2 * ARM)
-            near = near[apart]
-            if len(near) == 0:
-                continue
-            hit = near[np.argmin(np.linalg.norm(points[near] - arm[0], axis=1))]
-            other, i = segments[owner[hit]], int(index[hit])
-            if min(i, len(other) - 1 - i) < _NEAR_PX:
-                continue
-            along = other[min(i + 4, len(other) - 1)] - other[max(i - 4, 0)]
-            if abs(along @ heading) > _GLANCING * np.linalg.norm(along):
-                cuts.setdefault(int(owner[hit]), set()).add(i)
+        for reverse, at in ((segment, 0), (segment[::-1], len(segment) - 1)):
+            hit = near.side_hit(k, at, reverse[: _HEADING + 1])
+            if hit is not None:
+                cuts.setdefault(hit[0], set()).add(hit[1])
+        for i in _kinks(segment):
+            if len(near.others(k, i, segment[i])):
+                cuts.setdefault(k, set()).add(i)
     return tuple(
         piece
         for k, s in enumerate(segments)
         for piece in np.split(s, _apart(sorted(cuts.get(k, ()))))
         if len(piece) >= _SHORTEST
     )
+
+
+class _Neighbourhood:
+    """Which points of which segments are near a place."""
+
+    def __init__(self, segments: tuple[Float64, ...]) -> None:
+        self._segments = segments
+        self._points = np.concatenate(segments)
+        self._owner = np.repeat(np.arange(len(segments)), [len(s) for s in segments])
+        self._index = np.concatenate([np.arange(len(s)) for s in segments])
+        self._tree = cKDTree(self._points)
+
+    def others(self, k: int, at: int, place: Float64) -> Int64:
+        """Points near `place` that lie on another segment than `k`, or far from `at` on it."""
+        near = np.array(self._tree.query_ball_point(place, _NEAR_PX), dtype=np.int64)
+        apart = (self._owner[near] != k) | (abs(self._index[near] - at) > 2 * ARM)
+        return near[apart]
+
+    def side_hit(self, k: int, at: int, arm: Float64) -> tuple[int, int] | None:
+        """The segment, and where on it, that the end of segment `k` runs into along its side."""
+        heading = arm[0] - arm[-1]
+        heading = heading / max(float(np.linalg.norm(heading)), 1e-9)
+        near = self.others(k, at, arm[0] + 2 * heading)
+        if len(near) == 0:
+            return None
+        hit = near[np.argmin(np.linalg.norm(self._points[near] - arm[0], axis=1))]
+        owner, i = int(self._owner[hit]), int(self._index[hit])
+        other = self._segments[owner]
+        if min(i, len(other) - 1 - i) < _NEAR_PX:
+            return None
+        along = other[min(i + 4, len(other) - 1)] - other[max(i - 4, 0)]
+        glancing = abs(along @ heading) > _GLANCING * np.linalg.norm(along)
+        return (owner, i) if glancing else None
+
+
+def _kinks(segment: Float64) -> list[int]:
+    """Where a segment turns sharply, the sharpest place of each turn."""
+    if len(segment) <= 2 * _KINK_REACH:
+        return []
+    steps = segment[_KINK_REACH:] - segment[:-_KINK_REACH]
+    steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
+    cosine = (steps[:-_KINK_REACH] * steps[_KINK_REACH:]).sum(1)
+    kinks = np.flatnonzero(
+        (cosine < _KINK) & (cosine <= minimum_filter1d(cosine, 2 * _KINK_REACH + 1))
+    )
+    return (kinks + _KINK_REACH).tolist()
 
 
 def _apart(cuts: list[int]) -> list[int]:
