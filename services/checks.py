@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.messages import GraspReply, GraspRequest, Health, SeedReply
+from services.messages import Forget, Forgotten, GraspReply, GraspRequest, Health, SeedReply
 from suturetrack.camera import Camera, StereoRig
 from suturetrack.types import (
     Energies,
@@ -137,6 +137,10 @@ def _grasp(grasp: Grasp) -> None:
     _require(np.isfinite(grasp.sigma) and grasp.sigma >= 0, f"sigma {grasp.sigma}")
 
 
+def _thread(message: Forget | Forgotten) -> None:
+    check_name(message.thread, "thread")
+
+
 def _grasp_request(request: GraspRequest) -> None:
     check_name(request.thread, "thread")
     numbers = [np.ravel(v) for v in vars(request.where).values() if v is not None]
@@ -200,6 +204,8 @@ _CHECKS: dict[type[Any], Any] = {
     Seed: _seed,
     SeedReply: _seed_reply,
     Grasp: _grasp,
+    Forget: _thread,
+    Forgotten: _thread,
     GraspRequest: _grasp_request,
     GraspReply: _grasp_reply,
     Stamp: _stamp,

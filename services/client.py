@@ -30,13 +30,14 @@ from services.bus import DEPTH, Bus, NoAnswer, Reader
 from services.checks import check, check_name
 from services.freshness import Freshness
 from services.inbox import Inbox
-from services.messages import GraspRequest, SeedReply
+from services.messages import Forget, GraspRequest, SeedReply
 from services.topics import Question
 from services.zenoh_transport import ZenohTransport, load_config, local_config
 from suturetrack.camera import StereoRig
 from suturetrack.grasping import AWAY_FROM_CAMERA, GraspPoint
 from suturetrack.initialization import InitializationError
 from suturetrack.snapping import point_of_right_pixel
+from suturetrack.tracking.tracker import FORGOTTEN
 from suturetrack.types import Grasp, InputError, RidgeField, Seed, ThreadState
 
 Q = TypeVar("Q")
@@ -46,7 +47,7 @@ Point = tuple[float, float, float]
 
 _ARRIVAL_S = 3.0
 """How long whoever answers may take to appear."""
-_GRASP_S = 1.0
+_ANSWER_S = 2.0
 
 log = logging.getLogger("suturetrack")
 
@@ -208,6 +209,10 @@ class Client:
             raise Refused(reply.reason, reply.candidates)
         return reply
 
+    def forget(self, thread: str = "0") -> bool:
+        """Has a thread followed no more; whether there was such a thread. Raises Unavailable."""
+        return self._ask(topics.FORGET, Forget(thread), _ANSWER_S).known
+
     def grasp(
         self,
         thread: str = "0",
@@ -234,7 +239,7 @@ class Client:
             InputError: not exactly one place, or no direction.
         """
         where = GraspPoint(from_start, from_end, fraction, near)
-        reply = self._ask(topics.GRASP, GraspRequest(thread, where, approach), _GRASP_S)
+        reply = self._ask(topics.GRASP, GraspRequest(thread, where, approach), _ANSWER_S)
         if reply.grasp is None:
             raise Refused(reply.reason)
         return reply.grasp
@@ -296,6 +301,8 @@ class Client:
             seen = Seen(state, self._reader.arrived_ns)
             with self._lock:
                 self._latest[state.thread] = seen
+                if FORGOTTEN in state.events:
+                    del self._latest[state.thread]
                 for inbox, thread in self._listeners.items():
                     if thread in (None, state.thread):
                         inbox.put(seen)

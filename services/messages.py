@@ -65,6 +65,22 @@ class SeedReply:
 
 
 @dataclass(frozen=True)
+class Forget:
+    """A thread that nobody wants to be followed any more."""
+
+    thread: str
+
+
+@dataclass(frozen=True)
+class Forgotten:
+    """A thread was dropped."""
+
+    thread: str
+    known: bool
+    """Whether there was such a thread."""
+
+
+@dataclass(frozen=True)
 class GraspRequest:
     """Where a gripper would like to take a thread, and from which side."""
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 from services import topics
 from services.bus import Bus, Request
-from services.messages import SeedReply
+from services.messages import Forgotten, SeedReply
 from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, seed_pixel
 from suturetrack.tracking import Tracker
+from suturetrack.tracking.tracker import FORGOTTEN
 from suturetrack.types import InputError, Seed, Stamp
 
 
@@ -34,6 +35,7 @@ class SeedDesk:
     def __init__(self, bus: Bus, tracker: Tracker, rig: StereoRig, patience: int):
         self._bus, self._tracker, self._rig, self._patience = bus, tracker, rig, patience
         self._requests = bus.requests(topics.SEED)
+        self._forgets = bus.requests(topics.FORGET)
         self._cases: dict[str, _Case] = {}
 
     def seed(self, seed: Seed, request: Request[Seed, SeedReply] | None = None) -> None:
@@ -52,6 +54,8 @@ class SeedDesk:
         last = {state.thread: scaled(state, to_units) for state in self._bus.last(topics.STATE)}
         for seed in {seed.thread: seed for seed in (*given, *asked)}.values():
             state = last.get(seed.thread)
+            if state is not None and FORGOTTEN in state.events:
+                continue
             if state is None or state.curve is None:
                 self._tracker.seed(seed)
             else:
@@ -67,6 +71,15 @@ class SeedDesk:
                 request.answer(SeedReply(seed.thread, False, str(error)))
             else:
                 self._bus.publish(topics.SEEDING, request.question)
+
+    def take_forgets(self) -> None:
+        """Drops the threads that somebody wants to be dropped."""
+        while (request := self._forgets.get(0)) is not None:
+            thread = request.question.thread
+            case = self._cases.pop(thread, None)
+            if case is not None:
+                _answer(case, SeedReply(thread, False, "the thread was dropped"))
+            request.answer(Forgotten(thread, self._tracker.forget(thread)))
 
     def settle(
         self, stamp: Stamp, results: Mapping[str, Initialization | InitializationError]

@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, TypeVar
 
-from services.messages import GraspReply, GraspRequest, Health, SeedReply
+from services.messages import Forget, Forgotten, GraspReply, GraspRequest, Health, SeedReply
 from suturetrack.camera import StereoRig
 from suturetrack.types import RidgeField, Seed, Stamp, StereoFrame, ThreadState, Truth
 
@@ -73,7 +73,10 @@ SEED: Question[Seed, SeedReply] = Question(
 GRASP: Question[GraspRequest, GraspReply] = Question(
     "thread/{thread}/grasp", GraspRequest, GraspReply, "tracker", "where to take the thread"
 )
-QUESTIONS: tuple[Question[Any, Any], ...] = (CALIBRATION, SEED, GRASP)
+FORGET: Question[Forget, Forgotten] = Question(
+    "thread/{thread}/forget", Forget, Forgotten, "tracker", "follow this thread no more"
+)
+QUESTIONS: tuple[Question[Any, Any], ...] = (CALIBRATION, SEED, GRASP, FORGET)
 
 
 def root(rig: str) -> str:

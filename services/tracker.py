@@ -54,6 +54,7 @@ def run(service: Service, config: TrackerConfig) -> None:
     service.ready()
     for ridges in fields:
         desk.take_requests()
+        desk.take_forgets()
         step = tracker.step(ridges)
         for state in step.states:
             bus.publish(topics.STATE, scaled(state, rig.metres_per_unit))

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from services import checks
-from services.messages import GraspReply, GraspRequest, Health, SeedReply
+from services.messages import Forget, Forgotten, GraspReply, GraspRequest, Health, SeedReply
 from suturetrack.camera import StereoRig
 from suturetrack.types import (
     Grasp,
@@ -48,6 +48,8 @@ _SMALL: dict[type[Any], str] = {
     Seed: "seed/1",
     SeedReply: "seed-reply/1",
     Grasp: "grasp/1",
+    Forget: "forget/1",
+    Forgotten: "forgotten/1",
     GraspRequest: "grasp-request/1",
     GraspReply: "grasp-reply/1",
     Stamp: "stamp/1",

@@ -14,7 +14,7 @@ from services import topics, wire
 from services.bus import Bus
 from services.client import Client, Refused, Seen, Unavailable
 from services.memory_transport import Hub
-from services.messages import GraspReply, SeedReply
+from services.messages import Forgotten, GraspReply, SeedReply
 from suturetrack import nurbs
 from suturetrack.types import (
     Energies,
@@ -226,6 +226,21 @@ def test_grasps_are_answered_or_refused(stage: Stage) -> None:
         stage.client.grasp(fraction=0.5)
     with pytest.raises(InputError, match="exactly one"):
         stage.client.grasp(fraction=0.5, from_end=0.1)
+
+
+def test_a_forgotten_thread_is_gone_after_its_last_state(stage: Stage) -> None:
+    stage.tracker.answer(topics.FORGET, lambda f: Forgotten(f.thread, f.thread == "a"))
+    stage.tracker.declare_alive()
+    got = follow(stage)
+    stage.publish(1, "a")
+    until(lambda: stage.client.threads == ("a",))
+    assert stage.client.forget("a")
+    assert not stage.client.forget("b")
+    stamp = Stamp(2, 2 * PERIOD_NS, time.time_ns(), PERIOD_NS)
+    last = replace(stage.state, stamp=stamp, thread="a", events=("forgotten",))
+    stage.tracker.publish(topics.STATE, last)
+    until(lambda: stage.client.threads == ())
+    until(lambda: [frame for _, frame, _ in got][:2] == [1, 2])
 
 
 def test_nobody_there_is_said_plainly(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:

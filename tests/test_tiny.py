@@ -13,7 +13,7 @@ import pytest
 from services import segmenter, source, topics, tracker
 from services.bus import Bus
 from services.memory_transport import Hub
-from services.messages import Health
+from services.messages import Forget, Health
 from services.segmenter import SegmenterConfig
 from services.service import Service, ServiceConfig
 from services.source import SourceConfig
@@ -193,7 +193,12 @@ def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
     good = operator.ask(topics.SEED, Seed("right", pixel=seed[0]), 30)
     assert good.stamp is not None
     state = next(s for s in states if s.thread == "right" and s.stamp >= good.stamp)
+    forgotten = operator.ask(topics.FORGET, Forget("right"), 30)
+    last = next(s for s in states if s.events == ("forgotten",))
+    unknown = operator.ask(topics.FORGET, Forget("middle"), 30)
     rig.stop()
+    assert (forgotten.known, unknown.known) == (True, False)
+    assert (last.thread, last.curve) == ("right", None)
     assert not outside.accepted
     assert "outside the 640x480 left image" in outside.reason
     assert not nothing.accepted

@@ -194,8 +194,11 @@ def test_two_threads_keep_their_names(rig: StereoRig) -> None:
     assert [state.thread for state in step.states] == ["a", "b"]
     for state, truth in zip(step.states, pairs[-1], strict=True):
         assert error(state, truth).rms < 0.15
-    tracker.forget("a")
-    assert [s.thread for s in tracker.step(paint(rig, pair, 20)).states] == ["b"]
+    assert tracker.forget("a")
+    assert not tracker.forget("c")
+    gone, kept = tracker.step(paint(rig, pair, 20)).states
+    assert (gone.thread, gone.curve, gone.events) == ("a", None, ("forgotten",))
+    assert [s.thread for s in tracker.step(paint(rig, pair, 21)).states] == [kept.thread] == ["b"]
 
 
 def test_fields_that_repeat_or_come_late_change_nothing(rig: StereoRig) -> None:

@@ -14,7 +14,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from services import topics, wire
-from services.messages import GraspReply, GraspRequest, Health, Latency, SeedReply
+from services.messages import (
+    Forget,
+    Forgotten,
+    GraspReply,
+    GraspRequest,
+    Health,
+    Latency,
+    SeedReply,
+)
 from services.wire import Packet, WireError
 from suturetrack.camera import StereoRig
 from suturetrack.grasping import GraspPoint
@@ -80,6 +88,8 @@ MESSAGES: list[Any] = [
     SeedReply("0", True, "found 175 mm", STAMP, curve()),
     SeedReply("0", False, "no ridge there", candidates=((1.0, 2.0), (3.0, 4.0))),
     Grasp(STAMP, "0", np.ones(3), np.eye(3), 1e-4),
+    Forget("0"),
+    Forgotten("0", True),
     GraspRequest("0", GraspPoint(from_end=0.01)),
     GraspRequest("a", GraspPoint(near=(0.1, 0.2, 0.3)), (1.0, 0.0, 0.0)),
     GraspReply("0", Grasp(STAMP, "0", np.ones(3), np.eye(3), 1e-4)),

@@ -19,6 +19,8 @@ from suturetrack.tracking.recovery import find_again
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.types import Energies, Nurbs, RidgeField, Seed, Stamp, Status, ThreadState
 
+FORGOTTEN = "forgotten"
+"""Event of the last state of a thread that was dropped."""
 _BETWEEN_ATTEMPTS_NS = 150_000_000
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
@@ -54,6 +56,7 @@ class Tracker:
     ) -> None:
         self._rig, self._config, self._initialization = rig, config, initialization
         self._threads: dict[str, _Thread] = {}
+        self._forgotten: list[str] = []
 
     def seed(self, seed: Seed) -> None:
         """Looks for the thread from the next field on, for up to `config.patience` fields.
@@ -74,9 +77,15 @@ class Tracker:
         last = replace(last, status=Status.LOST, events=())
         self._threads[seed.thread] = _Thread(seed, 0, None, last)
 
-    def forget(self, thread: str) -> None:
-        """Drops the thread; unknown names are ignored."""
-        self._threads.pop(thread, None)
+    def forget(self, thread: str) -> bool:
+        """Drops the thread; the next step tells so in a last state without a curve.
+
+        Returns whether there was such a thread.
+        """
+        known = self._threads.pop(thread, None) is not None
+        if known:
+            self._forgotten.append(thread)
+        return known
 
     def step(self, field: RidgeField) -> TrackerStep:
         """The seeded threads in the next field.
@@ -84,7 +93,8 @@ class Tracker:
         A field that is not newer than the last one changes nothing: its states are the last ones.
         """
         initializations: dict[str, Initialization | InitializationError] = {}
-        states = []
+        states = [_not_found(name, field.stamp, (FORGOTTEN,)) for name in self._forgotten]
+        self._forgotten.clear()
         for name, thread in self._threads.items():
             if thread.follower is not None:
                 state = self._follow(name, thread, thread.follower, field)
