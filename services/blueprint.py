@@ -11,7 +11,7 @@ from services.drawing.common import VIEWS, part
 from suturetrack.types import Float64
 
 PROCESSES = ("source", "segmenter", "tracker")
-_IN_DETAIL = ("tangent", "reliability")
+_IN_DETAIL = ("tangent", "reliability", "velocity")
 _EYE = np.array([-0.7, -0.55, -0.75])
 """Where the eye of the view of space is from its target, in distances of the thread."""
 
@@ -29,9 +29,7 @@ def blueprint(threads: Sequence[str], target: Float64) -> rrb.Blueprint:
             ),
             _curve(names),
             _segmentation(),
-            rrb.Horizontal(
-                *(_view(view, "", "/growth/**") for view in VIEWS), name="Initialisation"
-            ),
+            _initialization(),
             _processes(),
             _parameters(),
         ),
@@ -41,7 +39,7 @@ def blueprint(threads: Sequence[str], target: Float64) -> rrb.Blueprint:
 
 
 def _scene(names: Sequence[str], target: Float64) -> rrb.Container:
-    images = rrb.Horizontal(*(_view(view, "", "/curve") for view in VIEWS))
+    images = rrb.Horizontal(*(_view(view, "", "/curve", "/truth/**") for view in VIEWS))
     # From the side, with the cameras at one edge and the thread at the other.
     middle, distance = 0.7 * target, np.linalg.norm(target)
     eye = rrb.EyeControls3D(
@@ -60,14 +58,16 @@ def _scene(names: Sequence[str], target: Float64) -> rrb.Container:
 
 def _plots(names: Sequence[str]) -> rrb.Container:
     return rrb.Vertical(
-        rrb.StateTimelineView(origin="/plots", name="Status", contents=_each(names, "status")),
+        rrb.StateTimelineView(
+            origin="/plots", name="Status and events", contents=_each(names, "status", "event")
+        ),
         _plot(
             "Energies of the images (best: -1) and of the ends",
-            *_each(names, "energy/image", "energy/end"),
+            *_each(names, "energy/image", "energy/end", "energy/event/**"),
         ),
         _plot("Length [mm]", *_each(names, "length")),
         _plot("Latency [ms]", "/plots/latency_ms/**"),
-        row_shares=[2, 5, 5, 4],
+        row_shares=[3, 5, 5, 4],
     )
 
 
@@ -75,10 +75,13 @@ def _curve(names: Sequence[str]) -> rrb.Container:
     parts = (*_IN_DETAIL, "control_points")
     contents = [f"/rig/thread/{name}/{part}" for name in names for part in parts]
     return rrb.Horizontal(
-        rrb.Spatial3DView(origin="/rig", name="Tangents and reliability", contents=contents),
+        rrb.Spatial3DView(
+            origin="/rig", name="Tangents, reliability, motion within 0.1 s", contents=contents
+        ),
         rrb.Vertical(
             _plot("Bending (no unit)", *_each(names, "energy/internal")),
             _plot("Control points", *_each(names, "control_points")),
+            _plot("Speed [mm/s]", *_each(names, "speed")),
         ),
         column_shares=[3, 2],
         name="Curve",
@@ -87,6 +90,13 @@ def _curve(names: Sequence[str]) -> rrb.Container:
 
 def _each(names: Sequence[str], *quantities: str) -> list[str]:
     return [f"/plots/{name}/{quantity}" for name in names for quantity in quantities]
+
+
+def _initialization() -> rrb.Container:
+    """The last growth over the field in which it happened, and what came of it."""
+    views = (_view(view, "/growth/**") for view in VIEWS)
+    words = rrb.TextDocumentView(origin="/log/initialization/0", name="Outcome")
+    return rrb.Horizontal(*views, words, column_shares=[4, 4, 2], name="Initialisation")
 
 
 def _segmentation() -> rrb.Container:

@@ -10,7 +10,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +23,7 @@ from services.messages import Health
 from services.run_file import RunFile
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
-from suturetrack.types import RidgeField, Stamp, StereoFrame, ThreadState, Truth
+from suturetrack.types import RidgeField, Seed, Stamp, StereoFrame, ThreadState, Truth
 
 _log = logging.getLogger(__name__)
 _BACKLOG = 32
@@ -124,11 +124,28 @@ class Recorder:
         at = published_ns or time.time_ns()
         self._hand_over(lambda file: file.states(states, at))
 
-    def initialization(
-        self, stamp: Stamp, thread: str, result: Initialization | InitializationError
+    def passed(self, stamp: Stamp, published_ns: int) -> None:
+        """Records that a frame was worked on while there was no thread."""
+        self._hand_over(lambda file: file.passed(stamp, published_ns))
+
+    def seed(self, stamp: Stamp, seed: Seed) -> None:
+        """Records a seed that came while the process ran, in metres, with the first frame it was used in."""
+        self._hand_over(lambda file: file.seed(stamp, seed))
+
+    def initializations(
+        self,
+        field: RidgeField,
+        seeds: Mapping[str, Seed],
+        results: Mapping[str, Initialization | InitializationError],
     ) -> None:
-        """Records how a thread was looked for in one field; the timeline `growth` counts the steps."""
-        self._hand_over(lambda file: file.initialization(stamp, thread, result))
+        """Records how threads were looked for in one field; the timeline `growth` counts the steps.
+
+        To be called before `states` of the same frame. `seeds` are in the calibration's unit; a
+        thread that is taken up again has none.
+        """
+        if results:
+            copy = replace(field, left=field.left.copy(), right=field.right.copy())
+            self._hand_over(lambda file: file.initializations(copy, seeds, results))
 
     def truth(self, truth: Truth) -> None:
         """Records where a synthetic thread really is."""

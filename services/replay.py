@@ -7,9 +7,9 @@ import threading
 import time
 import tomllib
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -19,8 +19,9 @@ from rich.progress import track
 
 from services import segmenter, topics, tracker
 from services.arguments import write_config
-from services.bus import Bus, Reader
+from services.bus import Bus, NoAnswer
 from services.memory_transport import Hub
+from services.recording import Recorder
 from services.run_folder import RunFolder
 from services.segmenter import SegmenterConfig
 from services.service import Service, ServiceConfig, Stopped
@@ -29,7 +30,7 @@ from suturetrack.calibration import save_calibration
 from suturetrack.initialization import InitializationConfig
 from suturetrack.segmentation import SegmentationConfig
 from suturetrack.tracking import TrackingConfig
-from suturetrack.types import InputError, RidgeField, Stamp, StereoFrame, Truth
+from suturetrack.types import InputError, RidgeField, Seed, Stamp, StereoFrame, ThreadState, Truth
 
 _STEP_S = 60.0
 _READY_S = 120.0
@@ -145,97 +146,149 @@ def _beside(run_dir: Path) -> Path:
 
 
 def _replay(folder: RunFolder, parameters: Parameters, config: ServiceConfig, first: str) -> None:
-    seed, hub = parameters.seed, Hub()
+    """Plays what the processes before `first` published to those that work anew, one by one."""
+    seed, rig = parameters.seed, folder.rig()
     track_config = TrackerConfig(config, seed, parameters.tracking, parameters.initialization)
-    bodies = {"tracker": lambda service: tracker.run(service, track_config)}
-    if first == "segmenter":
-        segment_config = SegmenterConfig(config, seed, parameters.segmentation)
-        bodies["segmenter"] = lambda service: segmenter.run(service, segment_config)
-    name = {"segmenter": "source", "tracker": "segmenter"}[first]
-    feeder = Service(name, config, Bus(hub.connect(), config.rig, name))
-    with feeder, _Threads(hub, config, bodies) as threads:
-        _feed(feeder, threads, folder, parameters)
+    segment_config = SegmenterConfig(config, seed, parameters.segmentation)
+    tracking = _Worker(_TRACKER, folder, config, lambda service: tracker.run(service, track_config))
+    segmenting = _Worker(
+        _SEGMENTER, folder, config, lambda service: segmenter.run(service, segment_config)
+    )
+    workers = {"segmenter": (segmenting, tracking), "tracker": (tracking,)}[first]
+    recorded: Iterator[Any] = folder.frames() if first == "segmenter" else folder.fields()
+    played = {"segmenter": "source", "tracker": "segmenter"}[first]
+    with (
+        ExitStack() as stack,
+        Recorder(config.run_dir, played, config.recording, rig, parameters) as recorder,
+    ):
+        for worker in workers:
+            stack.enter_context(worker)
+        truths = _by_frame(folder.truths())
+        for message in track(recorded, "Replaying", transient=True):
+            stamp = replace(message.stamp, released_ns=time.time_ns())
+            result: Any = replace(message, stamp=stamp)
+            _record(recorder, result, [replace(t, stamp=stamp) for t in truths[stamp.frame]])
+            for worker in workers:
+                result = result and worker.step(result)
+            for state in tracking.states():
+                segmenting.publish(topics.STATE, state)
+    left_out = sum(worker.left_out for worker in workers)
+    if left_out:
+        print(f"{left_out} frames were passed over, as they were in {folder.path}")
 
 
-def _feed(service: Service, threads: _Threads, folder: RunFolder, parameters: Parameters) -> None:
-    """Publishes what the process of this name published when the run was recorded."""
-    bus, rig = service.bus, folder.rig()
-    steps = bus.every(topics.STEP)
-    bus.answer(topics.CALIBRATION, lambda _: rig)
-    recorder = service.record(rig, parameters)
-    service.ready()
-    for process in threads.names:
-        threads.wait_until(partial(bus.wait_for_alive, process, 0.1), _READY_S)
-    truths = _by_frame(folder.truths())
-    is_source = service.name == "source"
-    recorded: Iterable[StereoFrame | RidgeField] = folder.frames() if is_source else folder.fields()
-    for old in track(recorded, "Replaying", transient=True):
-        message = replace(old, stamp=replace(old.stamp, released_ns=time.time_ns()))
-        for truth in truths[message.stamp.frame]:
-            recorder.truth(replace(truth, stamp=message.stamp))
-        if isinstance(message, StereoFrame):
-            bus.publish(topics.FRAME, message)
-            recorder.frame(message, service.finished(message.stamp))
-        else:
-            bus.publish(topics.FIELD, message)
-            recorder.field(message, service.finished(message.stamp))
-        threads.wait_until(partial(_is_done, steps, message.stamp.frame), _STEP_S)
+def _record(recorder: Recorder, message: StereoFrame | RidgeField, truths: list[Truth]) -> None:
+    if isinstance(message, StereoFrame):
+        recorder.frame(message)
+    else:
+        recorder.field(message)
+    for truth in truths:
+        recorder.truth(truth)
 
 
-class _Threads:
-    """The processes that work anew, as threads around one hub."""
+@dataclass(frozen=True)
+class _Part:
+    """A process of the dataflow, from outside."""
+
+    name: str
+    neighbour: str
+    """The process without which it does not start."""
+    takes: topics.Topic[Any]
+    gives: topics.Topic[Any]
+
+
+_SEGMENTER = _Part("segmenter", "tracker", topics.FRAME, topics.FIELD)
+_TRACKER = _Part("tracker", "segmenter", topics.FIELD, topics.STEP)
+
+
+class _Worker:
+    """A process that works anew, as a thread around a hub of its own; the others are played to it.
+
+    It is given the frames that it worked on when the run was recorded, and each seed with the frame
+    at which it took effect then.
+    """
 
     def __init__(
-        self, hub: Hub, config: ServiceConfig, bodies: dict[str, Callable[[Service], None]]
+        self,
+        part: _Part,
+        folder: RunFolder,
+        config: ServiceConfig,
+        body: Callable[[Service], None],
     ) -> None:
-        self._services = {
-            name: Service(name, config, Bus(hub.connect(), config.rig, name)) for name in bodies
-        }
-        self._threads = [
-            threading.Thread(target=self._run, args=(name, body), name=name, daemon=True)
-            for name, body in bodies.items()
-        ]
-        self._errors: list[BaseException] = []
+        hub = Hub()
+        self.left_out = 0
+        self._part, self._body = part, body
+        self._handled, self._seeds = folder.handled(part.name), folder.seeds(part.name)
+        self._bus = Bus(hub.connect(), config.rig, part.neighbour)
+        rig = folder.rig()
+        self._bus.answer(topics.CALIBRATION, lambda _: rig)
+        self._results = self._bus.every(part.gives)
+        self._states = self._bus.every(topics.STATE)
+        self._service = Service(part.name, config, Bus(hub.connect(), config.rig, part.name))
+        self._thread = threading.Thread(target=self._run, name=part.name, daemon=True)
+        self._error: BaseException | None = None
 
     def __enter__(self) -> Self:
-        for thread in self._threads:
-            thread.start()
+        self._bus.declare_alive()
+        self._thread.start()
+        self._wait_for(lambda: self._bus.wait_for_alive(self._part.name, 0.1), _READY_S)
         return self
 
     def __exit__(self, *_: object) -> None:
-        for service in self._services.values():
-            service.bus.stop.set()
-        for thread in self._threads:
-            thread.join()
+        self._service.bus.stop.set()
+        self._thread.join()
+        self._bus.close()
 
-    @property
-    def names(self) -> list[str]:
-        """Of the processes."""
-        return list(self._services)
+    def step(self, message: Any) -> Any:
+        """What the process makes of a message; None for a frame that it never worked on."""
+        frame = message.stamp.frame
+        if self._handled and frame not in self._handled:
+            self.left_out += 1
+            return None
+        while self._seeds and self._seeds[0][0] <= frame:
+            self._give(self._seeds.pop(0)[1])
+        self.publish(self._part.takes, message)
+        return self._wait_for(lambda: self._result(frame), _STEP_S)
 
-    def wait_until(self, condition: Callable[[], bool], seconds: float) -> None:
-        """Waits; raises what a process raised, or InputError when it takes too long."""
+    def states(self) -> Iterator[ThreadState]:
+        """The states that have come since."""
+        return iter(lambda: self._states.get(0), None)
+
+    def publish(self, topic: topics.Topic[Any], message: Any) -> None:
+        """Lets the process hear something, if it is there."""
+        self._bus.publish(topic, message)
+
+    def _give(self, seed: Seed) -> None:
+        if self._part is _SEGMENTER:
+            self.publish(topics.SEEDING, seed)
+        else:
+            # The question has arrived when this returns; what comes of it is in the new recording.
+            with suppress(NoAnswer):
+                self._bus.ask(topics.SEED, seed, timeout=0)
+
+    def _result(self, frame: int) -> Any:
+        result = self._results.get(0.1)
+        stamp = result if isinstance(result, Stamp) or result is None else result.stamp
+        return result if stamp is not None and stamp.frame >= frame else None
+
+    def _wait_for(self, answer: Callable[[], Any], seconds: float) -> Any:
+        """Waits; raises what the process raised, or InputError when it takes too long."""
         deadline = time.monotonic() + seconds
-        while not condition():
-            if self._errors:
-                raise self._errors[0]
+        while not (result := answer()):
+            if self._error is not None:
+                raise self._error
             if time.monotonic() > deadline:
-                raise InputError(f"replay: a step took longer than {seconds:g} s")
+                raise InputError(f"replay: the {self._part.name} took longer than {seconds:g} s")
+        return result
 
-    def _run(self, name: str, body: Callable[[Service], None]) -> None:
-        service = self._services[name]
+    def _run(self) -> None:
         try:
-            with service:
-                body(service)
+            with self._service:
+                self._body(self._service)
         except Stopped:
             pass
         except BaseException as error:
-            self._errors.append(error)
-
-
-def _is_done(steps: Reader[Stamp], frame: int) -> bool:
-    step = steps.get(0.1)
-    return step is not None and step.frame >= frame
+            self._error = error
 
 
 def _by_frame(truths: list[Truth]) -> dict[int, list[Truth]]:

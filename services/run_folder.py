@@ -28,6 +28,7 @@ from suturetrack.types import (
     InputError,
     Nurbs,
     RidgeField,
+    Seed,
     Stamp,
     Status,
     StereoFrame,
@@ -99,6 +100,17 @@ class RunFolder:
         """Where the synthetic threads really were, by frame and thread; empty for real scenes."""
         truths = [_truth(row) for row in self.rows("/rig/truth/**")]
         return sorted(truths, key=lambda t: (t.stamp.frame, t.thread))
+
+    def seeds(self, process: str) -> list[tuple[int, Seed]]:
+        """The seeds that came while a process ran, in metres, and the frames they took effect at."""
+        rows = [row for row in self.rows(f"/run/{process}/seed") if "frame" in row]
+        rows.sort(key=lambda row: (row["frame"], row["log_time"]))
+        return [(row["frame"], _seed(row)) for row in rows]
+
+    def handled(self, process: str) -> set[int]:
+        """The frames that a process worked on; empty without its recording."""
+        found = self.series(f"/plots/latency_ms/{process}").values()
+        return {int(frame) for frames, _ in found for frame in frames}
 
     def series(self, *contents: str) -> dict[str, tuple[Float64, Float64]]:
         """Plotted numbers by entity: ((n,) frames, (n,) or (n, k) values), by frame."""
@@ -301,6 +313,13 @@ def _state(row: Row) -> RecordedState:
     return RecordedState(state, int(numbers["published_ns"][0]))
 
 
+def _seed(row: Row) -> Seed:
+    def place(name: str) -> Any:
+        return tuple(row[name].tolist()) if name in row else None
+
+    return Seed(str(row["Seed:thread"][0]), place("Seed:pixel"), place("Seed:point_m"))
+
+
 def _truth(row: Row) -> Truth:
     return Truth(
         stamp=_stamp(row, "Truth"),
@@ -318,4 +337,5 @@ def _camera(numbers: Row, view: str) -> Camera:
         ("rectification", (3, 3)),
         ("projection", (3, 4)),
     )
-    return Camera(*(numbers[f"{view}_{name}"].reshape(shape) for name, shape in shapes))
+    arrays = {name: numbers[f"{view}_{name}"].reshape(shape) for name, shape in shapes}
+    return Camera(**arrays, fisheye=bool(np.any(numbers.get(f"{view}_fisheye", False))))

@@ -38,6 +38,11 @@ class SeedDesk:
         self._forgets = bus.requests(topics.FORGET)
         self._cases: dict[str, _Case] = {}
 
+    @property
+    def seeds(self) -> dict[str, Seed]:
+        """From where threads are looked for now, by thread; in the calibration's unit."""
+        return {thread: case.seed for thread, case in self._cases.items()}
+
     def seed(self, seed: Seed, request: Request[Seed, SeedReply] | None = None) -> None:
         """Has a thread looked for from the next field on; raises InputError outside the image."""
         seed_pixel(seed, self._rig)
@@ -61,8 +66,9 @@ class SeedDesk:
             else:
                 self._tracker.resume(seed, state)
 
-    def take_requests(self) -> None:
-        """Takes the seeds that have come in."""
+    def take_requests(self) -> list[Seed]:
+        """Takes the seeds that have come in; those that are looked for from now on, in metres."""
+        taken = []
         while (request := self._requests.get(0)) is not None:
             seed = scaled(request.question, 1 / self._rig.metres_per_unit)
             try:
@@ -71,6 +77,8 @@ class SeedDesk:
                 request.answer(SeedReply(seed.thread, False, str(error)))
             else:
                 self._bus.publish(topics.SEEDING, request.question)
+                taken.append(request.question)
+        return taken
 
     def take_forgets(self) -> None:
         """Drops the threads that somebody wants to be dropped."""

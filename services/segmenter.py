@@ -53,22 +53,23 @@ def run(service: Service, config: SegmenterConfig) -> None:
     seedings = bus.every(topics.SEEDING)
     states = bus.every(topics.STATE)
     adaptation = Adaptation(segmenter, rig, states, lockstep=config.service.lockstep)
-    seeds = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
+    given = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
     held = _Held(bus, rig) if config.service.resume else None
     if held is not None:
-        seeds = [seed for seed in seeds if seed.thread not in held.threads]
+        given = [seed for seed in given if seed.thread not in held.threads]
     if not bus.wait_for_alive("tracker"):
         raise Stopped
     frames = bus.newest(topics.FRAME)
     service.ready()
     for frame in frames:
-        while (seeding := seedings.get(0)) is not None:
-            seeds.append(scaled(seeding, 1 / rig.metres_per_unit))
         try:
-            while seeds:
-                segmenter.learn(frame, seeds.pop(0))
+            while given:
+                segmenter.learn(frame, given.pop(0))
             for place in held.seeds(frame.stamp) if held is not None else ():
                 segmenter.learn(frame, place)
+            while (seed := seedings.get(0)) is not None:
+                segmenter.learn(frame, scaled(seed, 1 / rig.metres_per_unit))
+                recorder.seed(frame.stamp, seed)
             ridges = segmenter.step(frame)
         except InputError as error:
             frames.refuse(str(error))

@@ -53,7 +53,8 @@ def run(service: Service, config: TrackerConfig) -> None:
     fields = bus.newest(topics.FIELD)
     service.ready()
     for ridges in fields:
-        desk.take_requests()
+        for seed in desk.take_requests():
+            recorder.seed(ridges.stamp, seed)
         desk.take_forgets()
         step = tracker.step(ridges)
         for state in step.states:
@@ -61,9 +62,11 @@ def run(service: Service, config: TrackerConfig) -> None:
         grasps.update(step.states)
         bus.publish(topics.STEP, ridges.stamp)
         published_ns = service.finished(ridges.stamp)
-        recorder.states(step.states, published_ns)
-        for thread, result in step.initializations.items():
-            recorder.initialization(ridges.stamp, thread, result)
+        recorder.initializations(ridges, desk.seeds, step.initializations)
+        if step.states:
+            recorder.states(step.states, published_ns)
+        else:
+            recorder.passed(ridges.stamp, published_ns)
         desk.settle(ridges.stamp, step.initializations)
     desk.close()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
@@ -16,7 +16,18 @@ from services.messages import Health
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
-from suturetrack.types import Float64, RidgeField, Stamp, Status, StereoFrame, ThreadState, Truth
+from suturetrack.types import (
+    Float64,
+    RidgeField,
+    Seed,
+    Stamp,
+    Status,
+    StereoFrame,
+    ThreadState,
+    Truth,
+)
+
+_LANE_FRAMES = 10
 
 
 class Writer:
@@ -29,6 +40,10 @@ class Writer:
         self.stream = stream
         self._stamp: Stamp | None = None
         self._statuses: dict[str, Status | None] = {}
+        self._before: dict[str, ThreadState] = {}
+        self._marked: dict[str, int] = {}
+        self._seeds: dict[str, Seed] = {}
+        self._seeded: set[str] = set()
         self._target: Float64 | None = None
 
     def describe(self) -> None:
@@ -57,33 +72,48 @@ class Writer:
         for state in states:
             self._introduce(state)
         stamp, published_ns = states[0].stamp, published_ns or time.time_ns()
-        self.write(stamp, drawing.states(states, self.rig, published_ns))
+        self.write(stamp, drawing.states(states, self._before, self.rig, published_ns))
         self._latency(stamp, published_ns)
         for state in states:
             self._tell(state)
+            self._mark(state)
+            self._before[state.thread] = state
 
-    def initialization(
-        self, stamp: Stamp, thread: str, result: Initialization | InitializationError
+    def passed(self, stamp: Stamp, published_ns: int) -> None:
+        """Records that a frame was worked on while there was no thread."""
+        self._latency(stamp, published_ns)
+
+    def seed(self, stamp: Stamp, seed: Seed) -> None:
+        """Records a seed that came while the process ran, in metres, with the first frame it was used in."""
+        # In metres, as it came: a replay to the bit must not round it.
+        place = {"pixel": seed.pixel} if seed.point is None else {"point_m": seed.point}
+        numbers = {"thread": seed.thread, **place}
+        self.write(stamp, [(f"/run/{self.process}/seed", drawing.values("Seed", numbers))])
+        self.log(f"thread {seed.thread}: a seed came")
+
+    def initializations(
+        self,
+        field: RidgeField,
+        seeds: Mapping[str, Seed],
+        results: Mapping[str, Initialization | InitializationError],
     ) -> None:
-        """Records how a thread was looked for in one field; the timeline `growth` counts the steps."""
-        stream = self.stream
-        if stream is None:
+        """Records how threads were looked for in one field; the timeline `growth` counts the steps."""
+        if self.stream is None or not results:
             return
-        for step, entries in enumerate(self._growth(thread, result), 1):
-            stream.set_time("growth", sequence=step)
-            self.write(stamp, entries)
-        stream.disable_timeline("growth")
-        if isinstance(result, InitializationError):
-            self.write(stamp, drawing.failure(thread, result.candidates, self.rig))
-            self.log(f"thread {thread} not found: {result.reason}", "WARN")
-        else:
-            found = f"thread {thread} found with confidence {result.confidence:.2f}"
-            self.log("; ".join((found, *result.reasons)))
+        self.write(field.stamp, drawing.cleared(field, self.rig))
+        for thread, result in results.items():
+            seed = seeds.get(thread)
+            if seed is not None:
+                self.write(field.stamp, drawing.seed(seed, self.rig))
+                if seed is not self._seeds.get(thread):
+                    self._seeds[thread] = seed
+                    self._seeded.add(thread)
+            self._initialization(self.stream, field.stamp, thread, result)
 
     def truth(self, truth: Truth) -> None:
         """Records where a synthetic thread really is."""
         if self.stream is not None:
-            self.write(truth.stamp, drawing.truth(truth))
+            self.write(truth.stamp, drawing.truth(truth, self.rig))
 
     def health(self, health: Health) -> None:
         """Records the process's heartbeat, at its newest frame."""
@@ -131,10 +161,38 @@ class Writer:
         latency_ms = ((published_ns or time.time_ns()) - stamp.released_ns) / 1e6
         self.write(stamp, [(f"/plots/latency_ms/{self.process}", rr.Scalars(latency_ms))])
 
-    def _growth(
-        self, thread: str, result: Initialization | InitializationError
-    ) -> Iterable[list[Entry]]:
-        return () if result.growth is None else drawing.growth(thread, result.growth, self.rig)
+    def _initialization(
+        self,
+        stream: rr.RecordingStream,
+        stamp: Stamp,
+        thread: str,
+        result: Initialization | InitializationError,
+    ) -> None:
+        if result.growth is not None:
+            for step, entries in enumerate(drawing.growth(thread, result.growth, self.rig), 1):
+                stream.set_time("growth", sequence=step)
+                self.write(stamp, entries)
+            stream.disable_timeline("growth")
+        self.write(stamp, drawing.outcome(stamp, thread, result))
+        if isinstance(result, InitializationError):
+            self.write(stamp, drawing.failure(thread, result.candidates, self.rig))
+            self.log(f"thread {thread} not found: {result.reason}", "WARN")
+        else:
+            found = f"thread {thread} found with confidence {result.confidence:.2f}"
+            self.log("; ".join((found, *result.reasons)))
+
+    def _mark(self, state: ThreadState) -> None:
+        """The state's events on the plots, and in their lane for as long as it takes to see them."""
+        frame, thread = state.stamp.frame, state.thread
+        happened = drawing.kinds(state, seeded=thread in self._seeded)
+        self._seeded.discard(thread)
+        if happened:
+            self.write(state.stamp, drawing.marks(state, happened))
+            self.write(state.stamp, drawing.lane(thread, happened[0]))
+            self._marked[thread] = frame
+        elif frame - self._marked.get(thread, frame) >= _LANE_FRAMES:
+            del self._marked[thread]
+            self.write(state.stamp, drawing.lane(thread, None))
 
     def _introduce(self, state: ThreadState) -> None:
         assert self.stream is not None

@@ -29,6 +29,7 @@ from suturetrack.types import (
     Float32,
     Nurbs,
     RidgeField,
+    Seed,
     Stamp,
     Status,
     StereoFrame,
@@ -60,7 +61,9 @@ def record_run(run_dir: Path, rig: StereoRig, curve: Nurbs) -> None:
             source.truth(Truth(stamp, "0", _points(curve), 1.0, np.ones(300, bool)))
             segmenter.field(RidgeField(stamp, field, field))
             if i == 0:
-                tracker.initialization(stamp, "0", _initialization(curve, rig))
+                seeds = {"0": Seed("0", pixel=(300.0, 205.0))}
+                found = {"0": _initialization(curve, rig)}
+                tracker.initializations(RidgeField(stamp, field, field), seeds, found)
             tracker.states([_state(curve, stamp)])
         for recorder in (source, segmenter, tracker):
             name = recorder.process

@@ -28,6 +28,7 @@ from suturetrack.types import (
     Energies,
     Nurbs,
     RidgeField,
+    Seed,
     Stamp,
     Status,
     StereoFrame,
@@ -270,7 +271,7 @@ def test_the_log_warns_of_every_loss(tmp_path: Path, rig: StereoRig, curve: Nurb
 
 
 def test_the_growth_can_be_followed_step_by_step(
-    tmp_path: Path, rig: StereoRig, curve: Nurbs
+    tmp_path: Path, rig: StereoRig, curve: Nurbs, ridges: RidgeField
 ) -> None:
     cost = np.full((480, 640), np.inf, np.float32)
     cost[100:110, 50:250] = np.arange(200)
@@ -280,9 +281,10 @@ def test_the_growth_can_be_followed_step_by_step(
     )
     growth = Growth(view, view, np.stack([line[::10], line[::10] - [20, 0]], axis=1))
     found = Initialization(curve, 0.75, ("one end is hidden",), 0.3, growth)
+    nothing = InitializationError("no ridge", line[:3])
+    seeds = {"0": Seed("0", pixel=(60.0, 105.0)), "1": Seed("1", pixel=(9.0, 9.0))}
     with Recorder(tmp_path, "tracker", "light", rig) as recorder:
-        recorder.initialization(STAMP, "0", found)
-        recorder.initialization(STAMP, "1", InitializationError("no ridge", line[:3]))
+        recorder.initializations(ridges, seeds, {"0": found, "1": nothing})
     folder = RunFolder(tmp_path)
     root = "/rig/right/image/growth/0"
     fronts = sorted(rows(folder, f"{root}/front"), key=lambda r: r["growth"])
@@ -295,6 +297,12 @@ def test_the_growth_can_be_followed_step_by_step(
     assert np.allclose(row(folder, f"{root}/merges")["LineStrips2D:strips"][0], [[1, 2], [3, 4]])
     rejected = row(folder, f"{root}/rejected")
     assert rejected["LineStrips2D:labels"].tolist() == ["too short"]
+    begun = row(folder, "/rig/left/image/growth/0/seed")["Points2D:positions"]
+    assert begun.tolist() == [[60.0, 105.0]]
+    words = row(folder, "/log/initialization/0")["TextDocument:text"][0]
+    for said in ("frame 7", "confidence 0.75", "one end is hidden", "Rejected, right: 1"):
+        assert said in words
+    assert "1x too short" in words
     candidates = row(folder, "/rig/left/image/growth/1/candidates")["Points2D:positions"]
     assert np.allclose(candidates, line[:3])
     texts = [r["TextLog:text"][0] for r in rows(folder, "/log/tracker")]

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
+from services import segmenter, topics, tracker
 from services.arguments import write_config
+from services.bus import Bus, NoAnswer
+from services.memory_transport import Hub
 from services.recording import Recorder
 from services.replay import Parameters, ReplayConfig, changed, run
 from services.run_folder import RecordedState, RunFolder
+from services.segmenter import SegmenterConfig
+from services.service import Service, ServiceConfig
+from services.tracker import TrackerConfig
+from suturetrack.camera import StereoRig
 from suturetrack.stage import open_scene
-from suturetrack.types import InputError, Stamp, StereoFrame
+from suturetrack.types import InputError, Seed, Stamp, StereoFrame, ThreadState
 
 FRAMES = 4
 
@@ -43,12 +54,119 @@ def states(run_dir: Path) -> list[RecordedState]:
 
 def bits(run_dir: Path) -> list[bytes]:
     """The states to the bit, without the times at which they were made."""
-    kept = []
-    for state in (recorded.state for recorded in states(run_dir)):
-        assert state.curve is not None
-        arrays = (state.curve.knots, state.curve.control_points, state.sigma, state.seen)
-        kept.append(b"".join(a.tobytes() for a in arrays) + str(state.energies).encode())
-    return kept
+    found = [recorded.state for recorded in states(run_dir)]
+    return [curve_bits(state) + str(state.energies).encode() for state in found]
+
+
+def curve_bits(state: ThreadState) -> bytes:
+    """Everything of a state that is an array."""
+    arrays = [state.sigma, state.seen]
+    if state.curve is not None:
+        arrays += [state.curve.knots, state.curve.control_points]
+    return b"".join(a.tobytes() for a in arrays)
+
+
+@pytest.fixture(scope="module")
+def seeded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose threads are seeded while it goes on, one of them twice, and not all of whose frames
+    reach every process."""
+    run_dir: Path = tmp_path_factory.mktemp("seeded") / "run"
+    hub, config = Hub(), ServiceConfig(run_dir=run_dir, recording="full", lockstep=True)
+    scene = open_scene("two-threads")
+    (run_dir).mkdir()
+    write_config(Parameters(), run_dir / "config.toml")
+    with (
+        processes(hub, config, scene.rig) as bus,
+        Recorder(run_dir, "source", "full", scene.rig) as recorder,
+    ):
+        steps = bus.every(topics.STEP)
+        first, second = (scene.seed_pixel(0, name) for name in scene.threads)
+        point = scene.truth(5)[0].points[140] * scene.rig.metres_per_unit
+        seeds = {1: Seed("a", pixel=first), 3: Seed("b", pixel=second)}
+        seeds |= {5: Seed("a", point=(float(point[0]), float(point[1]), float(point[2])))}
+        for i in range(8):
+            frame = StereoFrame(Stamp(i, i * 33_000_000, 0), *scene.render(i))
+            recorder.frame(frame)
+            if i in (2, 6):
+                continue  # the segmenter never sees it
+            if i in seeds:
+                with suppress(NoAnswer):
+                    bus.ask(topics.SEED, seeds[i], timeout=0)
+            bus.publish(topics.FRAME, frame)
+            step = steps.get(60)
+            assert step is not None
+            assert step.frame == i
+    return run_dir
+
+
+@contextmanager
+def processes(hub: Hub, config: ServiceConfig, rig: StereoRig) -> Iterator[Bus]:
+    """Segmenter and tracker as threads, and the source's end of the hub."""
+    bodies = {
+        "segmenter": lambda service: segmenter.run(service, SegmenterConfig(config)),
+        "tracker": lambda service: tracker.run(service, TrackerConfig(config)),
+    }
+    bus = Bus(hub.connect(), config.rig, "source")
+    bus.answer(topics.CALIBRATION, lambda _: rig)
+    bus.every(topics.STEP)
+    services = {
+        name: Service(name, config, Bus(hub.connect(), config.rig, name)) for name in bodies
+    }
+
+    def play(name: str) -> None:
+        with services[name]:
+            bodies[name](services[name])
+
+    threads = [threading.Thread(target=play, args=(name,), daemon=True) for name in bodies]
+    for thread in threads:
+        thread.start()
+    for name in bodies:
+        assert bus.wait_for_alive(name, 60)
+    yield bus
+    for service in services.values():
+        service.bus.stop.set()
+    for thread in threads:
+        thread.join()
+    bus.close()
+
+
+def named_bits(run_dir: Path) -> list[tuple[int, str, str, bytes]]:
+    """As `bits`, with frame and thread, of states that may have no curve."""
+    return [
+        (s.stamp.frame, s.thread, str(s.status), curve_bits(s) + str(s.energies).encode())
+        for s in (recorded.state for recorded in RunFolder(run_dir).states())
+    ]
+
+
+@pytest.mark.parametrize("first", ["segmenter", "tracker"])
+def test_seeds_sent_live_take_effect_at_the_same_frames_again(
+    tmp_path: Path, seeded: Path, first: Literal["segmenter", "tracker"]
+) -> None:
+    folder = RunFolder(seeded)
+    assert [(frame, s.thread) for frame, s in folder.seeds("tracker")] == [
+        *((1, "a"), (3, "b"), (5, "a"))
+    ]
+    assert [frame for frame, _ in folder.seeds("segmenter")] == [3, 4, 7]
+    states = named_bits(seeded)
+    assert [(frame, name) for frame, name, *_ in states] == [
+        *((1, "a"), (3, "a"), (3, "b"), (4, "a"), (4, "b"), (5, "a"), (5, "b"), (7, "a"), (7, "b"))
+    ]
+    again = tmp_path / "again"
+    run(ReplayConfig(seeded, again, first, recording="full"))
+    assert named_bits(again) == states
+    assert [(f, s.thread, s.point) for f, s in RunFolder(again).seeds("tracker")] == [
+        (f, s.thread, s.point) for f, s in folder.seeds("tracker")
+    ]
+    run(ReplayConfig(again, tmp_path / "once more", "tracker"))
+    assert named_bits(tmp_path / "once more") == states
+
+
+def test_without_its_seed_a_thread_is_not_found_again(tmp_path: Path, seeded: Path) -> None:
+    deaf = tmp_path / "deaf"
+    shutil.copytree(seeded, deaf)
+    (deaf / "tracker.rrd").unlink()
+    run(ReplayConfig(deaf, tmp_path / "again", "tracker"))
+    assert named_bits(tmp_path / "again") == []
 
 
 @pytest.mark.parametrize("first", ["segmenter", "tracker"])

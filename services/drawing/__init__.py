@@ -6,18 +6,25 @@ pixels, points in the calibration's unit, plots in the units that their names ca
 
 from services.drawing.common import Entry, Level, values
 from services.drawing.curves import states, thread_style, truth
-from services.drawing.growth import failure, growth
+from services.drawing.events import kinds, lane, marks
+from services.drawing.growth import cleared, failure, growth, outcome, seed
 from services.drawing.images import cameras, field, frame, process_style
 
 __all__ = [
     "Entry",
     "Level",
     "cameras",
+    "cleared",
     "failure",
     "field",
     "frame",
     "growth",
+    "kinds",
+    "lane",
+    "marks",
+    "outcome",
     "process_style",
+    "seed",
     "states",
     "thread_style",
     "truth",

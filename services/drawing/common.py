@@ -29,6 +29,8 @@ ORANGE: Color = (250, 130, 60)
 VIOLET: Color = (200, 130, 240)
 TURQUOISE: Color = (120, 200, 200)
 GRAY: Color = (150, 150, 150)
+YELLOW: Color = (235, 225, 60)
+PINK: Color = (255, 110, 200)
 WHITE: Color = (245, 245, 245)
 _JPEG_QUALITY = 80
 

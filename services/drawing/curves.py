@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -15,17 +15,20 @@ from services.drawing.common import (
     GRAY,
     GREEN,
     ORANGE,
+    PINK,
     RED,
     TURQUOISE,
     VIEWS,
     VIOLET,
     WHITE,
+    YELLOW,
     Color,
     Entry,
     part,
     series,
     values,
 )
+from services.drawing.events import event_style
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.types import Bool, Float64, Image, Status, ThreadState, Truth
@@ -38,23 +41,32 @@ _NONE = np.empty((0, 3))
 _DENSE = 240
 _DASH = 5
 _ARROWS = 24
-_WORST_SIGMA_PX = 3.0
+_WORST_SIGMA_PX = 8.0
+_LEVELS = 4
+_AHEAD_S = 0.1
+_LONGEST_STEP_S = 0.5
 
 
-def states(states: Sequence[ThreadState], rig: StereoRig, published_ns: int) -> Iterator[Entry]:
-    """The curves: over both images, in space, and as plots."""
-    strips = [_strips(state) for state in states]
+def states(
+    states: Sequence[ThreadState],
+    before: Mapping[str, ThreadState],
+    rig: StereoRig,
+    published_ns: int,
+) -> Iterator[Entry]:
+    """The curves: over both images, in space, and as plots; `before` are the last states by thread."""
+    strips = [_strips(state, rig) for state in states]
     curves = [state.curve.control_points for state in states if state.curve is not None]
     yield from _overlays([strip for pieces in strips for strip in pieces], curves, rig)
     for state, pieces in zip(states, strips, strict=True):
         yield from _in_space(state, pieces, rig)
+        yield from _motion(state, before.get(state.thread), rig)
         yield from _plots(state, rig)
         numbers = values("ThreadState", _numbers(state, published_ns))
         yield f"/rig/thread/{part(state.thread)}/nurbs", numbers
 
 
-def truth(truth: Truth) -> Iterator[Entry]:
-    """The true thread of a synthetic scene."""
+def truth(truth: Truth, rig: StereoRig) -> Iterator[Entry]:
+    """The true thread of a synthetic scene: over both images, and in space."""
     numbers = {
         "thread": truth.thread,
         "capture_ns": truth.stamp.capture_ns,
@@ -62,8 +74,13 @@ def truth(truth: Truth) -> Iterator[Entry]:
         "length": truth.length,
         "visible": truth.visible,
     }
-    line = rr.LineStrips3D([truth.points], colors=[WHITE], radii=-0.75)
+    line = rr.LineStrips3D([truth.points], colors=[PINK], radii=-0.5)
     yield f"/rig/truth/{part(truth.thread)}", line, values("Truth", numbers)
+    few = truth.points[np.linspace(0, len(truth.points) - 1, _DENSE).astype(int)]
+    for view, pixels in zip(VIEWS, rig.project_raw(few), strict=True):
+        # Below the curve, so that it shows where the curve is not.
+        strip = rr.LineStrips2D([_finite(pixels)], colors=PINK, radii=-1.0, draw_order=10)
+        yield f"/rig/{view}/image/truth/{part(truth.thread)}", strip
 
 
 def thread_style(thread: str) -> Iterator[Entry]:
@@ -74,8 +91,10 @@ def thread_style(thread: str) -> Iterator[Entry]:
     yield f"{plots}/energy/internal", series(bending=TURQUOISE)
     yield f"{plots}/length", series(length=GREEN)
     yield f"{plots}/control_points", series(control_points=RED)
+    yield f"{plots}/speed", series(mean=TURQUOISE, fastest=ORANGE)
     colors = [(*c, 255) for c in _STATUS_COLORS.values()]
     yield f"{plots}/status", rr.StateConfiguration(values=statuses, colors=colors)
+    yield from event_style(thread)
 
 
 def _overlays(
@@ -116,6 +135,24 @@ def _in_space(state: ThreadState, strips: list[Strip], rig: StereoRig) -> Iterat
     yield f"{root}/reliability", rr.Points3D(samples, colors=reliable, radii=-2.5)
 
 
+def _motion(state: ThreadState, before: ThreadState | None, rig: StereoRig) -> Iterator[Entry]:
+    """Where the curve will be in a tenth of a second; along itself its motion cannot be seen."""
+    origins = ahead = _NONE
+    speed = [np.nan, np.nan]
+    seconds = 0.0 if before is None else (state.stamp.capture_ns - before.stamp.capture_ns) / 1e9
+    if state.curve and before and before.curve and 0 < seconds < _LONGEST_STEP_S:
+        s = np.linspace(0, 1, _ARROWS)
+        origins, tangents = nurbs.evaluate(state.curve, s), nurbs.tangents(state.curve, s)
+        velocity = (origins - nurbs.evaluate(before.curve, s)) / seconds
+        velocity -= (velocity * tangents).sum(axis=1, keepdims=True) * tangents
+        ahead = velocity * _AHEAD_S
+        mm = np.linalg.norm(velocity, axis=1) * rig.metres_per_unit * 1000
+        speed = [float(mm.mean()), float(mm.max())]
+    arrows = rr.Arrows3D(origins=origins, vectors=ahead, colors=TURQUOISE, radii=-1.0)
+    yield f"/rig/thread/{part(state.thread)}/velocity", arrows
+    yield f"/plots/{part(state.thread)}/speed", rr.Scalars(speed)
+
+
 def _plots(state: ThreadState, rig: StereoRig) -> Iterator[Entry]:
     root, energies = f"/plots/{part(state.thread)}", state.energies
     yield f"{root}/energy/image", rr.Scalars([energies.image_left, energies.image_right])
@@ -150,21 +187,26 @@ def _numbers(state: ThreadState, published_ns: int) -> dict[str, Any]:
     }
 
 
-def _strips(state: ThreadState) -> list[Strip]:
-    """The curve in pieces: solid where it is seen, dashed where it is not, gray where it is lost."""
+def _strips(state: ThreadState, rig: StereoRig) -> list[Strip]:
+    """The curve in pieces: solid in the colour of its reliability where it is seen, dashed where it
+    is not, gray where it is lost."""
     if state.curve is None:
         return []
     s = np.linspace(0, 1, _DENSE)
     points = nurbs.evaluate(state.curve, s)
     if state.status is Status.LOST:
         return [(piece, GRAY) for piece in _dashes(points)]
-    seen = _sampled(state.seen, s)
-    edges = [0, *(np.flatnonzero(np.diff(seen)) + 1), _DENSE]
+    nearest = np.rint(s * (len(state.seen) - 1)).astype(int)
+    badness = _badness(state.sigma[nearest] * rig.focal / points[:, 2])
+    level = np.minimum((badness * _LEVELS).astype(int), _LEVELS - 1)
+    level[~state.seen[nearest]] = -1
+    edges = [0, *(np.flatnonzero(np.diff(level)) + 1), _DENSE]
+    colors = _ramp(np.linspace(0, 1, _LEVELS)).tolist()
     strips: list[Strip] = []
     for start, stop in pairwise(edges):
         piece = points[start : stop + 1]
-        if seen[start]:
-            strips.append((piece, GREEN))
+        if level[start] >= 0:
+            strips.append((piece, colors[level[start]]))
         else:
             strips += [(dash, AMBER) for dash in _dashes(piece)]
     return strips
@@ -174,18 +216,21 @@ def _dashes(points: Float64) -> list[Float64]:
     return [points[i : i + _DASH] for i in range(0, len(points), 2 * _DASH)]
 
 
-def _sampled(seen: Bool, s: Float64) -> Bool:
-    return seen[np.rint(s * (len(seen) - 1)).astype(int)]
-
-
 def _finite(pixels: Float64) -> Float64:
     return pixels[np.isfinite(pixels).all(axis=1)]
 
 
 def _reliability_colors(sigma_px: Float64, seen: Bool) -> Image:
-    """(K, 3) RGB: green where the images hold the curve, over yellow to red; gray where unseen."""
-    badness = np.clip(np.nan_to_num(sigma_px, nan=np.inf) / _WORST_SIGMA_PX, 0, 1)[:, None]
-    half = np.minimum(2 * badness, 1), np.maximum(2 * badness - 1, 0)
-    green, amber, red = (np.array(c, float) for c in (GREEN, AMBER, RED))
-    colors = green + half[0] * (amber - green) + half[1] * (red - amber)
-    return np.where(seen[:, None], colors, GRAY).astype(np.uint8)
+    """(K, 3) RGB; gray where unseen."""
+    return np.where(seen[:, None], _ramp(_badness(sigma_px)), GRAY).astype(np.uint8)
+
+
+def _badness(sigma_px: Float64) -> Float64:
+    """From 0, where the images hold the curve, to 1."""
+    return np.clip(np.nan_to_num(sigma_px, nan=np.inf) / _WORST_SIGMA_PX, 0, 1)
+
+
+def _ramp(badness: Float64) -> Image:
+    """(K, 3) RGB from green over yellow to red."""
+    places, colors = (0.0, 0.5, 1.0), np.array([GREEN, YELLOW, RED], float).T
+    return np.stack([np.interp(badness, places, c) for c in colors], axis=1).astype(np.uint8)
