@@ -134,10 +134,11 @@ def _make_run_folder(config: RunConfig, rig: StereoRig) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_config(config, folder / "config.toml")
-        if config.input.calibration is None:
-            save_calibration(folder / "calibration.yaml", rig)
+        given = config.input.calibration
+        if given is not None and given.is_file():
+            shutil.copyfile(given, folder / "calibration.yaml")
         else:
-            shutil.copyfile(config.input.calibration, folder / "calibration.yaml")
+            save_calibration(folder / "calibration.yaml", rig)
     except OSError as error:
         raise InputError(f"run folder {folder}: {error.strerror}") from error
 

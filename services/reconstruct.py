@@ -12,8 +12,8 @@ import numpy as np
 import tyro
 
 from services.sources.footage import halves, read_image
+from services.sources.rig import check_size, open_rig
 from suturetrack import nurbs
-from suturetrack.calibration import load_calibration
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import (
     Initialization,
@@ -49,6 +49,10 @@ class ReconstructConfig:
     """Two images, or one whose left half is the left view."""
     unit: Literal["m", "mm"] | None = None
     """Unit of the calibration; guessed from the baseline when not given."""
+    scale: float = 1.0
+    """How many times as wide and high the images are as those that were calibrated."""
+    rectified: bool = False
+    """The images are rectified already, with the projections of this calibration."""
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
 
@@ -61,7 +65,7 @@ def run(config: ReconstructConfig) -> None:
             file is written.
     """
     left, right = _load(config)
-    rig = load_calibration(config.calibration, config.unit)
+    rig = open_rig(config.calibration, config.unit, config.scale, rectified=config.rectified)
     _check(left, right, rig)
     frame = StereoFrame(Stamp(0, 0, 0), left, right)
     seed = Seed(pixel=config.seed)
@@ -108,12 +112,7 @@ def _check(left: Image, right: Image, rig: StereoRig) -> None:
             f"the images differ in size: left {_size(left)}, right {_size(right)}; "
             "give a pair of one camera setting"
         )
-    width, height = rig.image_size
-    if left.shape[:2] != (height, width):
-        raise InputError(
-            f"the images are {_size(left)}, the calibration is for {width}x{height}; "
-            "use the calibration of this size"
-        )
+    check_size((left.shape[1], left.shape[0]), rig, "the images", "the calibration")
     for name, image in (("left", left), ("right", right)):
         if int(image.max()) == int(image.min()):
             raise InputError(f"the {name} image is empty: every pixel is {int(image.max())}")

@@ -71,6 +71,8 @@ class Service:
         self.bus = bus
         self.meter = Meter()
         self.recorder: Recorder | None = None
+        self.warning = ""
+        """What is wrong at present, for the health; empty when nothing is."""
         self._unrecorded: deque[Health] = deque(maxlen=8)
         self._complaints: deque[str] = deque(maxlen=8)
         self._last_complaint = float("-inf")
@@ -131,7 +133,7 @@ class Service:
             dropped=self.bus.dropped + self.meter.skipped,
             refused=self.bus.refused,
             memory_mb=psutil.Process().memory_info().rss / 1e6,
-            warning=(self.recorder and self.recorder.problem) or "",
+            warning=self.warning or (self.recorder and self.recorder.problem) or "",
             restarts=self.config.resume,
         )
 

@@ -14,7 +14,8 @@ from services import topics
 from services.bus import Reader
 from services.service import Service, ServiceConfig
 from services.sources import Footage, InputConfig, open_input
-from services.sources.footage import Exposure
+from services.sources.footage import Exposure, Stalled
+from services.sources.interlace import CombWatch
 from services.wire import scaled
 from suturetrack.types import InputError, Stamp, Status, StereoFrame
 
@@ -57,11 +58,14 @@ def run(service: Service, config: SourceConfig) -> None:
     service.ready()
     if not footage.live and not bus.wait_for_alive("segmenter"):
         return
+    combs = CombWatch()
     period_ns = 0 if config.service.lockstep else round(1e9 / footage.fps)
     pace = _Pace(service, footage, config.input.frames, _left_off(service))
     for index, exposure in pace:
         stamp = Stamp(index, exposure.capture_ns, _released_ns(footage, exposure), period_ns)
         frame = StereoFrame(stamp, exposure.left, exposure.right)
+        if combs.sees(exposure.left):
+            service.complain("the video seems interlaced: de-interlace it, thin threads comb")
         truths = [dataclasses.replace(truth, stamp=stamp) for truth in exposure.truths]
         for truth in truths:
             bus.publish(topics.TRUTH, scaled(truth, rig.metres_per_unit))
@@ -107,13 +111,26 @@ class _Pace:
         index = self._index
         if self._service.bus.stop.is_set or (self._frames is not None and index >= self._frames):
             raise StopIteration
-        exposure = self._footage.read(index)
+        exposure = self._read(index)
         due_in = self._began + index / self._footage.fps - time.monotonic()
         stopped = not self._patient and due_in > 0 and self._service.bus.stop.wait(due_in)
         if exposure is None or stopped:
             raise StopIteration
         self.last, self._index = index, index + 1
         return index, exposure
+
+    def _read(self, index: int) -> Exposure | None:
+        """The frame with that number, whenever a stalled camera gives it; None at the end."""
+        while not self._service.bus.stop.is_set:
+            try:
+                exposure = self._footage.read(index)
+            except Stalled as stall:
+                self._service.warning = str(stall)
+                self._service.complain(str(stall))
+            else:
+                self._service.warning = ""
+                return exposure
+        return None
 
     def _skip(self) -> None:
         due = int((time.monotonic() - self._began) * self._footage.fps)

@@ -1,4 +1,7 @@
-"""What frames can come from: the bench top, folders of image pairs, videos, cameras."""
+"""What frames can come from, chosen by what the source's name is.
+
+The bench top, folders of image pairs, videos, cameras, bags, ROS 2 topics: a module for each.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from services.ros2_graph import RosConfig
+from services.sources.bag import BagFootage, is_bag
 from services.sources.camera import CameraFootage, is_device
 from services.sources.folder import FolderFootage
-from services.sources.footage import Footage
+from services.sources.footage import Footage, Stalled
 from services.sources.loop import LoopFootage
+from services.sources.rig import adapt, check_size, open_rig
+from services.sources.ros2 import Ros2Footage
 from services.sources.stage import StageFootage
 from services.sources.video import VideoFootage
-from suturetrack.calibration import load_calibration
 from suturetrack.camera import StereoRig
 from suturetrack.stage import Picture
 from suturetrack.types import InputError
 
 STAGE = "stage:"
+ROS2 = "ros2:"
 
 
 @dataclass(frozen=True)
@@ -26,11 +33,24 @@ class InputConfig:
 
     source: str
     """A folder with left/*.png and right/*.png; a side-by-side video; two videos or devices as
-    LEFT,RIGHT; a device number or path; stage:NAME for the synthetic bench top."""
+    LEFT,RIGHT; a device number or path; a ROS bag or MCAP file; ros2:LEFT,RIGHT for two image topics;
+    stage:NAME for the synthetic bench top."""
     calibration: Path | None = None
-    """Calibration of the rig; the bench top knows its own."""
+    """Calibration of the rig: an OpenCV file, a Kalibr camchain, a folder with ROS's left.yaml and
+    right.yaml, or the two as LEFT,RIGHT. The bench top knows its own, and ROS has camera_info."""
     unit: Literal["m", "mm"] | None = None
     """Unit of the calibration; guessed from the baseline without it."""
+    scale: float = 1.0
+    """How many times as wide and high the images are as those that were calibrated."""
+    rectified: bool = False
+    """The images are rectified already, with the projections of this calibration; image_rect topics
+    are without saying so."""
+    topics: tuple[str, str] | None = None
+    """LEFT RIGHT image topics of a bag; found by their names without it."""
+    slop_ms: float = 10.0
+    """Left and right ROS images are a pair when their stamps lie no further apart."""
+    ros: RosConfig = field(default_factory=RosConfig)
+    """Where the ROS 2 graph is."""
     fps: float = 30.0
     """Frames a second of folders and of the bench top; videos know theirs."""
     frames: int | None = None
@@ -60,20 +80,31 @@ def open_input(config: InputConfig) -> tuple[Footage, StereoRig]:
 
 
 def _open(config: InputConfig) -> tuple[Footage, StereoRig]:
+    if not 0 <= config.slop_ms <= 1000:
+        raise InputError(f"slop-ms {config.slop_ms:g}: use milliseconds from 0 to 1000")
     if config.source.startswith(STAGE):
         return _open_stage(config)
-    if config.calibration is None:
-        raise InputError("--calibration FILE is needed; only stage: sources know their own")
-    rig = load_calibration(config.calibration, config.unit)
     footage = _open_footage(config)
-    if footage.size != rig.image_size:
-        (w, h), (rig_w, rig_h) = footage.size, rig.image_size
+    try:
+        return footage, _rig_of(footage, config)
+    except InputError:
         footage.close()
-        raise InputError(
-            f"source {config.source}: its views are {w}x{h}, but calibration {config.calibration} "
-            f"is for {rig_w}x{rig_h}; give the calibration of these images"
-        )
-    return footage, rig
+        raise
+
+
+def _rig_of(footage: Footage, config: InputConfig) -> StereoRig:
+    ros = footage if isinstance(footage, BagFootage | Ros2Footage) else None
+    rectified = config.rectified or (ros is not None and ros.rectified)
+    if config.calibration is not None:
+        rig = open_rig(config.calibration, config.unit, config.scale, rectified=rectified)
+        name = f"calibration {config.calibration}"
+    elif ros is not None:
+        rig = adapt(ros.rig(config.unit), config.scale, rectified=rectified)
+        name = "camera_info"
+    else:
+        raise InputError("--calibration FILE is needed; only stage: and ROS know their own")
+    check_size(footage.size, rig, f"source {config.source}", name)
+    return rig
 
 
 def _open_stage(config: InputConfig) -> tuple[Footage, StereoRig]:
@@ -81,13 +112,18 @@ def _open_stage(config: InputConfig) -> tuple[Footage, StereoRig]:
     stage = StageFootage(name, config.scene_seed, config.scene_rig, config.fps, config.picture)
     if config.calibration is None:
         return stage, stage.rig
-    rig = load_calibration(config.calibration, config.unit)
-    if rig.image_size != stage.size:
-        raise InputError(f"calibration {config.calibration}: not for {stage.size} px of {name}")
+    rig = open_rig(config.calibration, config.unit, config.scale, rectified=config.rectified)
+    check_size(stage.size, rig, f"source {config.source}", f"calibration {config.calibration}")
     return stage, rig
 
 
 def _open_footage(config: InputConfig) -> Footage:
+    slop_ns = round(config.slop_ms * 1e6)
+    if config.source.startswith(ROS2):
+        names = config.source.removeprefix(ROS2).split(",")
+        return Ros2Footage(names, config.ros, slop_ns, wants_rig=config.calibration is None)
+    if is_bag(Path(config.source)):
+        return BagFootage(Path(config.source), config.topics, slop_ns, config.fps)
     parts = config.source.split(",")
     if len(parts) > 2:
         raise InputError(f"source {config.source}: at most two files or devices, LEFT,RIGHT")
@@ -98,4 +134,4 @@ def _open_footage(config: InputConfig) -> Footage:
     return VideoFootage([Path(part) for part in parts])
 
 
-__all__ = ["Footage", "InputConfig", "open_input"]
+__all__ = ["Footage", "InputConfig", "Stalled", "open_input"]

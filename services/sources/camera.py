@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import cv2
 
-from services.sources.footage import Exposure, halves
+from services.sources.footage import Exposure, Stalled, halves
+from services.sources.live import STALL_S, Newest
 from suturetrack.types import Image, InputError
+
+_FIRST_S = 15.0
+"""Some cameras take their time to start."""
+_RETRY_S = 0.5
+_GOODBYE_S = 2.0
 
 
 def is_device(name: str) -> bool:
@@ -16,7 +23,13 @@ def is_device(name: str) -> bool:
 
 
 class CameraFootage:
-    """Frames as the cameras give them, stamped when they arrive."""
+    """Frames as the cameras give them, stamped when they arrive.
+
+    A camera that gives no more images is closed and opened again until it does.
+
+    Raises:
+        InputError: a camera cannot be opened, or gives no image at all.
+    """
 
     live = True
     frame_count: int | None = None
@@ -24,31 +37,86 @@ class CameraFootage:
 
     def __init__(self, names: list[str]):
         self._names = names
-        self._captures = [_open(name) for name in names]
-        first = self.read(0)
-        height, width = first.left.shape[:2]
+        self._newest = Newest()
+        self._closing = threading.Event()
+        captures = [_open(name) for name in names]
+        self.fps = float(captures[0].get(cv2.CAP_PROP_FPS)) or 30.0
+        self._thread = threading.Thread(target=self._take, args=(captures,), daemon=True)
+        self._thread.start()
+        try:
+            self._first: Exposure | None = self._newest.get(_FIRST_S, self._complaint)
+        except Stalled as stall:
+            self.close()
+            raise InputError(f"{stall}; is it connected, and free?") from stall
+        height, width = self._first.left.shape[:2]
         self.size = width, height
-        self.fps = float(self._captures[0].get(cv2.CAP_PROP_FPS)) or 30.0
 
     def read(self, index: int) -> Exposure:
         """See `Footage`."""
-        grabbed = [capture.grab() for capture in self._captures]
+        if index == 0 and self._first is not None:
+            return self._first
+        self._first = None
+        exposure = self._newest.get(STALL_S, self._complaint)
+        height, width = exposure.left.shape[:2]
+        if (width, height) != self.size:
+            raise InputError(f"{self._where}: images are {width}x{height} now, were {self.size}")
+        return exposure
+
+    def close(self) -> None:
+        """See `Footage`."""
+        self._closing.set()
+        self._thread.join(_GOODBYE_S)
+
+    @property
+    def _where(self) -> str:
+        return f"camera {','.join(self._names)}"
+
+    @property
+    def _complaint(self) -> str:
+        return f"{self._where}: no image"
+
+    def _take(self, captures: list[cv2.VideoCapture]) -> None:
+        """Takes exposures until closing; in a thread, for a driver may wait for long."""
+        while not self._closing.is_set():
+            try:
+                exposure = self._expose(captures)
+            except InputError as error:
+                self._newest.fail(error)
+                break
+            if exposure is not None:
+                self._newest.put(exposure)
+                continue
+            _release(captures)
+            self._closing.wait(_RETRY_S)
+            captures = self._reopened()
+        _release(captures)
+
+    def _expose(self, captures: list[cv2.VideoCapture]) -> Exposure | None:
+        # All are grabbed before any is decoded, to be as near in time as they can be.
+        grabbed = [capture.grab() for capture in captures]
         now_ns = time.time_ns()
+        if not captures or not all(grabbed):
+            return None
         images: list[Image] = []
-        for name, capture, ok in zip(self._names, self._captures, grabbed, strict=True):
-            decoded, image = capture.retrieve() if ok else (False, None)
+        for capture in captures:
+            decoded, image = capture.retrieve()
             if not decoded or image is None:
-                raise InputError(f"camera {name}: no image after {index} frames; is it connected?")
+                return None
             images.append(image)
         left, right = images if len(images) == 2 else halves(images[0], self._names[0])
         if left.shape != right.shape:
             raise InputError(f"cameras: left is {left.shape}, right is {right.shape}")
         return Exposure(now_ns, left, right)
 
-    def close(self) -> None:
-        """See `Footage`."""
-        for capture in self._captures:
-            capture.release()
+    def _reopened(self) -> list[cv2.VideoCapture]:
+        captures: list[cv2.VideoCapture] = []
+        try:
+            for name in self._names:
+                captures.append(_open(name))
+        except InputError:
+            _release(captures)
+            return []
+        return captures
 
 
 def _open(name: str) -> cv2.VideoCapture:
@@ -56,3 +124,8 @@ def _open(name: str) -> cv2.VideoCapture:
     if not capture.isOpened():
         raise InputError(f"camera {name}: cannot be opened; is it there, and may you read it?")
     return capture
+
+
+def _release(captures: list[cv2.VideoCapture]) -> None:
+    for capture in captures:
+        capture.release()

@@ -26,6 +26,10 @@ class Exposure:
     """Where the threads really are, when that is known."""
 
 
+class Stalled(Exception):
+    """Live input sends nothing at present; it may again, so asking again is right."""
+
+
 class Footage(Protocol):
     """A source of stereo frames."""
 
@@ -45,6 +49,7 @@ class Footage(Protocol):
 
         Raises:
             InputError: the frame cannot be read.
+            Stalled: live input, and no frame for a second.
         """
 
     def close(self) -> None:

@@ -45,6 +45,6 @@ def check_size(size: tuple[int, int], rig: StereoRig, images: str, calibration: 
     elif abs(width * for_height - height * for_width) <= max(size):
         advice += f", or --scale {width / for_width:.6g} if they were resized after the camera"
     raise InputError(
-        f"{images}: its views are {width}x{height}, but {calibration} is for "
+        f"{images}: views are {width}x{height}, but {calibration} is for "
         f"{for_width}x{for_height}; {advice}"
     )
