@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ _SWING = 0.01
 """Price of a bridge that bends one way and then the other."""
 _LEAD = 0.1
 """How much cheaper than its best rival a merge must be to be beyond doubt."""
+_LONGEST_RUN = 4
+"""Segments that two strands may share in a row."""
 _FREE_END = 0.5
 """Price of an end without a partner: two of them make the highest price of a merge."""
 
@@ -102,32 +105,80 @@ def merge_ends(ridges: Ridges, config: InitializationConfig) -> Merged:
 def _share(
     segments: tuple[Float64, ...], partner: dict[int, int], price: dict[tuple[int, int], float]
 ) -> tuple[Float64, ...]:
-    """Doubles the segments that a second strand waits for at both ends."""
-    free: dict[int, list[tuple[float, int]]] = {}
+    """Doubles the runs of segments that a second strand waits for at both ends."""
+    waiting: dict[int, tuple[float, int]] = {}
     for (i, j), cost in price.items():
         if i in partner and j not in partner and cost < 2 * _FREE_END:
-            free.setdefault(i, []).append((cost, j))
+            waiting[i] = min(waiting.get(i, (np.inf, -1)), (cost, j))
+    found = [(waiting[run[0]][0] + waiting[run[-1] ^ 1][0], run) for run in _runs(waiting, partner)]
     copies = list(segments)
-    for k, segment in enumerate(segments):
-        start, stop = 2 * k, 2 * k + 1
-        if start not in free or stop not in free:
-            continue
-        (_, one), (_, other) = min(free[start]), min(free[stop])
+    taken: set[int] = set()
+    for _, run in sorted(found):
+        one, other = waiting[run[0]][1], waiting[run[-1] ^ 1][1]
         if one == other or one in partner or other in partner:
             continue
-        copy = 2 * len(copies)
-        copies.append(segment)
-        price |= {(copy + (e & 1), j): c for (e, j), c in price.items() if e in (start, stop)}
-        price |= {(j, e): c for (e, j), c in price.items() if e in (copy, copy + 1)}
-        last = partner[stop]
-        # Of the two ways to connect the strands none may close a loop.
-        if _leads_to(one, partner) == other:
-            pairs = [(one, copy), (copy + 1, last), (stop, other)]
-        else:
-            pairs = [(one, copy), (copy + 1, other)]
-        for i, j in pairs:
-            partner[i], partner[j] = j, i
+        if any(e // 2 in taken for e in run):
+            continue
+        taken.update(e // 2 for e in run)
+        _double(run, one, other, copies, partner, price)
     return tuple(copies)
+
+
+def _runs(waiting: dict[int, tuple[float, int]], partner: dict[int, int]) -> list[list[int]]:
+    """Ends at which joined segments are entered, from one end where a strand waits to another."""
+    runs = []
+    for start in waiting:
+        run = [start]
+        while True:
+            leave = run[-1] ^ 1
+            if leave in waiting and start < leave:
+                runs.append(run.copy())
+            if leave not in partner or len(run) == _LONGEST_RUN or partner[leave] in run:
+                break
+            run.append(partner[leave])
+    return runs
+
+
+def _double(
+    run: list[int],
+    one: int,
+    other: int,
+    copies: list[Float64],
+    partner: dict[int, int],
+    price: dict[tuple[int, int], float],
+) -> None:
+    """Leads a second strand, which waits with the ends `one` and `other`, through a run."""
+    start, stop = run[0], run[-1] ^ 1
+    first, last = partner[start], partner[stop]
+    # Of the two ways to connect the strands none may close a loop; else the smoother one is taken.
+    ring = _leads_to(one, partner) == other or _is_ring(start, partner)
+    if ring or other == _leads_to(first, partner) or one == _leads_to(last, partner):
+        swap = ring
+    else:
+        straight = price.get((one, other), 2.0) + price.get((first, last), 2.0)
+        swap = price.get((one, last), 2.0) + price.get((first, other), 2.0) < straight
+    copied = {}
+    for entry in run:
+        for end in (entry, entry ^ 1):
+            copied[end] = 2 * len(copies) + (end & 1)
+        copies.append(copies[entry // 2])
+    price |= {(copied[e], j): c for (e, j), c in price.items() if e in copied}
+    price |= {(j, copied[e]): c for (j, e), c in price.items() if e in copied}
+    pairs = [(copied[a ^ 1], copied[b]) for a, b in pairwise(run)]
+    pairs += [(one, copied[start])]
+    pairs += [(copied[stop], last), (stop, other)] if swap else [(copied[stop], other)]
+    for i, j in pairs:
+        partner[i], partner[j] = j, i
+
+
+def _is_ring(start: int, partner: dict[int, int]) -> bool:
+    """Whether the segments joined to that of the end `start` lead back to it."""
+    end = start ^ 1
+    while end in partner:
+        end = partner[end] ^ 1
+        if end == start ^ 1:
+            return True
+    return False
 
 
 def _leads_to(end: int, partner: dict[int, int]) -> int:
