@@ -57,6 +57,7 @@ def run(service: Service, config: SegmenterConfig) -> None:
     held = _Held(bus, rig) if config.service.resume else None
     if held is not None:
         given = [seed for seed in given if seed.thread not in held.threads]
+    bus.keep(topics.STEP)
     if not bus.wait_for_alive("tracker"):
         raise Stopped
     frames = bus.newest(topics.FRAME)
