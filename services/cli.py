@@ -50,6 +50,8 @@ VERBS = {
     "calibration": _Verb(
         "services.calibration", "CalibrationConfig", "check a calibration, also against images"
     ),
+    "router": _Verb("services.router", "RouterConfig", "pass messages between hosts"),
+    "keys": _Verb("services.keys", "KeysConfig", "certificates and access rules for several hosts"),
     "scenes": _Verb("services.scenes", "ScenesConfig", "pictures of the synthetic bench top"),
     "bench": _Verb("services.bench", "BenchConfig", "accuracy and speed beside references"),
     "source": _Verb("services.source", "SourceConfig", "the process that releases frames", True),

@@ -10,6 +10,9 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
+# A signal may reach another thread than the main one, which handles it only when it wakes up.
+_LONGEST_WAIT_S = 0.25
+
 
 class Stop:
     """Tells every waiting loop of a process to end."""
@@ -63,7 +66,7 @@ class Inbox(Generic[T]):
                 left = None if deadline is None else deadline - time.monotonic()
                 if left is not None and left <= 0:
                     return None
-                self._stop.condition.wait(left)
+                self._stop.condition.wait(min(left or _LONGEST_WAIT_S, _LONGEST_WAIT_S))
             return None if self._stop.is_set else self._items.popleft()
 
     def __iter__(self) -> Iterator[T]:

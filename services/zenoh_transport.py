@@ -141,7 +141,7 @@ class ZenohTransport:
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise InputError(_explain(error)) from error
+            raise InputError(explain(error)) from error
         self._patient = patient
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._kept: list[object] = []
@@ -318,7 +318,8 @@ def _packet(message: zenoh.Sample | zenoh.Query) -> Packet:
     )
 
 
-def _explain(error: zenoh.ZError) -> str:
+def explain(error: zenoh.ZError) -> str:
+    """What went wrong when a session was opened, on one line."""
     text = _first_line(error)
     if "Unable to acquire lock" in text:
         socket = Path(text.partition(" listener on ")[2].partition(" - ")[0])

@@ -1,0 +1,55 @@
+"""`suturetrack router`: a Zenoh router between the hosts of one or more rigs."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import zenoh
+
+from services.zenoh_transport import explain, load_config
+from suturetrack.types import InputError
+
+
+@dataclass(frozen=True)
+class RouterConfig:
+    """Passes messages between hosts until it is stopped; what passes, its configuration says."""
+
+    zenoh: Path | None = None
+    """A Zenoh configuration file, as `suturetrack keys init` makes one; without it, the router listens
+    on tcp/127.0.0.1:7447 and lets everything pass."""
+
+
+def run(config: RouterConfig) -> None:
+    """Runs until SIGINT or SIGTERM; raises InputError."""
+    settings = zenoh.Config() if config.zenoh is None else load_config(config.zenoh)
+    if config.zenoh is None:
+        settings.insert_json5("mode", '"router"')
+        settings.insert_json5("scouting/multicast/enabled", "false")
+        settings.insert_json5("listen/endpoints", '["tcp/127.0.0.1:7447"]')
+    elif json.loads(settings.get_json("mode")) != "router":
+        raise InputError(f'zenoh {config.zenoh}: a router needs mode: "router"')
+    zenoh.init_log_from_env_or("error")
+    stop = threading.Event()
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)
+    try:
+        with zenoh.open(settings):
+            print(f"router: listening on {', '.join(_endpoints(settings))}", flush=True)
+            stop.wait()
+    except zenoh.ZError as error:
+        raise InputError(explain(error)) from error
+
+
+def _endpoints(settings: zenoh.Config) -> list[str]:
+    endpoints = json.loads(settings.get_json("listen/endpoints"))
+    return endpoints if isinstance(endpoints, list) else endpoints["router"]
