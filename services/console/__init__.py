@@ -1,0 +1,59 @@
+"""`suturetrack console`: the operator's page, a process of its own that only listens and asks."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.console.feed import Feed
+from services.console.server import serve
+from services.service import Service, ServiceConfig
+from services.service import run as run_service
+from suturetrack.types import InputError
+
+_NICE = 5
+
+
+@dataclass(frozen=True)
+class ConsoleConfig:
+    """Serves a page with the live images, on which threads are seeded and watched."""
+
+    rig: str = "rig"
+    """Name of the rig."""
+    zenoh: Path | None = None
+    """The Zenoh configuration file of the running system, if it has one."""
+    host: str = "127.0.0.1"
+    """Address to serve on. Beyond this machine the page asks for the token that is printed, and goes
+    over the network in the clear: put a tunnel or a TLS proxy before it."""
+    port: int = 8470
+    """Port to serve on; 0 takes a free one."""
+
+
+def run(config: ConsoleConfig) -> None:
+    """Serves until SIGINT or SIGTERM.
+
+    Raises:
+        InputError: the address or the configuration cannot be used.
+    """
+    token = "" if _is_loopback(config.host) else secrets.token_urlsafe(16)
+
+    def body(service: Service) -> None:
+        # Whatever else the machine has to do comes first.
+        os.nice(_NICE)
+        feed = Feed(service.bus)
+        service.bus.declare_alive()
+        serve(feed, config.host, config.port, token)
+
+    run_service("console", ServiceConfig(rig=config.rig, zenoh=config.zenoh), body)
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError as error:
+        raise InputError(f"host {host!r}: use an address such as 127.0.0.1 or 0.0.0.0") from error
