@@ -50,6 +50,8 @@ VERBS = {
     "calibration": _Verb(
         "services.calibration", "CalibrationConfig", "check a calibration, also against images"
     ),
+    "status": _Verb("services.status", "StatusConfig", "what runs, live in the terminal"),
+    "doctor": _Verb("services.doctor", "DoctorConfig", "what is wrong, and what to do"),
     "router": _Verb("services.router", "RouterConfig", "pass messages between hosts"),
     "keys": _Verb("services.keys", "KeysConfig", "certificates and access rules for several hosts"),
     "console": _Verb("services.console", "ConsoleConfig", "the operator's page: watch and seed"),

@@ -48,11 +48,7 @@ def socket_directory(rig: str) -> Path:
     Raises:
         InputError: it cannot be made, or others could reach into it.
     """
-    runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
-    if runtime.is_absolute() and os.access(runtime, os.W_OK):
-        base = runtime / "suturetrack"
-    else:
-        base = Path(f"/tmp/suturetrack-{os.getuid()}")
+    base = _base()
     try:
         for directory in (base, base / rig):
             directory.mkdir(mode=0o700, exist_ok=True)
@@ -66,12 +62,24 @@ def socket_directory(rig: str) -> Path:
     return base / rig
 
 
+def local_rigs() -> list[str]:
+    """Names of the rigs of which processes of this user listen on this machine."""
+    return sorted({path.parent.name for path in _base().glob("*/*.sock")})
+
+
 def remove_sockets(rig: str) -> None:
     """Removes the sockets that killed processes of a rig left behind; no process of it may run."""
     directory = socket_directory(rig)
     for path in directory.iterdir():
         path.unlink(missing_ok=True)
     directory.rmdir()
+
+
+def _base() -> Path:
+    runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
+    if runtime.is_absolute() and os.access(runtime, os.W_OK):
+        return runtime / "suturetrack"
+    return Path(f"/tmp/suturetrack-{os.getuid()}")
 
 
 def local_config(rig: str, process: str) -> zenoh.Config:
