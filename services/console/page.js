@@ -77,7 +77,10 @@ function take(answer) {
     const { thread, view } = answer.asked;
     state.trouble = answer.accepted ? [] : [{ view, pixels: answer.candidates }];
     if (answer.accepted) state.added = state.added.filter((name) => name !== thread);
-    say(`Thread ${thread}: ${answer.text}`, answer.accepted ? "good" : "bad");
+    const [outcome, ...doubts] = answer.text.split("; ");
+    const more = answer.accepted && doubts.length > 2 ? `; and ${doubts.length - 1} more doubts` : "";
+    const words = more ? `${outcome}; ${doubts[0]}${more}` : answer.text;
+    say(`Thread ${thread}: ${words}`, answer.accepted ? "good" : "bad");
   } else if (answer.answer === "forget") {
     state.history.delete(answer.asked.thread);
     say(answer.text, answer.accepted ? "good" : "bad");
