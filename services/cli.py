@@ -64,6 +64,7 @@ VERBS = {
     "tracker": _Verb(
         "services.tracker", "TrackerConfig", "the process that holds the threads", True
     ),
+    "ros2": _Verb("services.ros2", "Ros2Config", "the process that bridges to ROS 2", True),
 }
 
 

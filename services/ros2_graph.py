@@ -28,6 +28,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import zenoh
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
@@ -153,6 +154,10 @@ def _zero(node: Nodetype, details: Any) -> Any:
         return new(details)
     if node == Nodetype.BASE:
         return {"string": "", "bool": False}.get(details[0], 0)
+    (element, kind), length = details
+    if element == Nodetype.BASE and kind[0] != "string":
+        size = length if node == Nodetype.ARRAY else 0
+        return np.zeros(size, "uint8" if kind[0] in ("byte", "char") else kind[0])
     return []
 
 
