@@ -17,7 +17,8 @@ from services.sources import Footage, InputConfig, open_input
 from services.sources.footage import Exposure, Stalled
 from services.sources.interlace import CombWatch
 from services.wire import scaled
-from suturetrack.types import InputError, Stamp, Status, StereoFrame
+from suturetrack.tracking.tracker import FORGOTTEN
+from suturetrack.types import InputError, Stamp, Status, StereoFrame, ThreadState
 
 _LONGEST_STEP_S = 60.0
 """Lock-step: how long the others may take for one frame."""
@@ -53,7 +54,7 @@ def run(service: Service, config: SourceConfig) -> None:
     first = footage.read(0)
     if first is not None:
         bus.make_room(StereoFrame(Stamp(0, 0, 0), first.left, first.right))
-    bus.keep(topics.STATE, lambda state: state.status is not Status.LOST)
+    bus.keep(topics.STATE, _is_worth_keeping)
     bus.keep(topics.SEEDING)
     service.ready()
     if not footage.live and not bus.wait_for_alive("segmenter"):
@@ -137,6 +138,11 @@ class _Pace:
         if due > self._index + _BUFFERED:
             self._service.meter.skipped += due - self._index
             self._index = due
+
+
+def _is_worth_keeping(state: ThreadState) -> bool:
+    """Whether a tracker that is started again can use it: where the thread is, or that it is dropped."""
+    return state.status is not Status.LOST or FORGOTTEN in state.events
 
 
 def _left_off(service: Service) -> Stamp | None:

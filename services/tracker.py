@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 
 from services import topics
+from services.gate import Gate
 from services.grasping import GraspDesk
 from services.seeding import SeedDesk
 from services.service import Service, ServiceConfig, Stopped
@@ -52,7 +53,14 @@ def run(service: Service, config: TrackerConfig) -> None:
         raise Stopped
     fields = bus.newest(topics.FIELD)
     service.ready()
+    gate = Gate(rig, ordered=not config.service.lockstep)
     for ridges in fields:
+        refusal = gate.refusal(ridges)
+        if refusal:
+            fields.refuse(refusal)
+            continue
+        if gate.began_anew:
+            desk.resume(given)
         for seed in desk.take_requests():
             recorder.seed(ridges.stamp, seed)
         desk.take_forgets()
