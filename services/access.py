@@ -33,7 +33,7 @@ class Role:
     @property
     def publishes(self) -> tuple[Topic[Any], ...]:
         """Topics of its own; health aside, which every process publishes."""
-        return tuple(t for t in TOPICS if t.publisher == self.name)
+        return tuple(t for t in TOPICS if t.publisher in (self.name, *self.processes))
 
     @property
     def keeps(self) -> tuple[Topic[Any], ...]:
@@ -46,7 +46,15 @@ class Role:
         return tuple(q for q in QUESTIONS if q.server == self.name)
 
 
-_WATCHED = (topics.FRAME, topics.FIELD, topics.STATE, topics.TRUTH, topics.SEEDING, topics.HEALTH)
+_WATCHED = (
+    topics.FRAME,
+    topics.FIELD,
+    topics.STATE,
+    topics.TRUTH,
+    topics.SEEDING,
+    topics.SNAP,
+    topics.HEALTH,
+)
 _ALL_QUESTIONS = (topics.CALIBRATION, topics.SEED, topics.FORGET, topics.GRASP)
 _RECALLED = (topics.STATE, topics.SEEDING)
 
@@ -80,7 +88,7 @@ ROLES = {
         Role(
             "operator",
             "watches, seeds, and asks for grasps",
-            reads=_WATCHED,
+            reads=(*_WATCHED, topics.TOOL),
             asks=_ALL_QUESTIONS,
             recalls=_RECALLED,
             processes=("run", "client", "console", "tooltip"),

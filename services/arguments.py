@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from suturetrack.types import InputError
+
 FLAT = ("service", "input")
 """Fields whose own fields are options without a prefix."""
+
+_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 def arguments_of(config: Any, prefix: str = "") -> list[str]:
@@ -25,6 +30,14 @@ def arguments_of(config: Any, prefix: str = "") -> list[str]:
         elif value != field.default:
             options += _option(prefix, field.name, value)
     return options
+
+
+def metres(length: str) -> float:
+    """A length with its unit, such as `10mm`, in metres; raises InputError."""
+    found = re.fullmatch(r"([-+]?[0-9]*\.?[0-9]+(?:e-?[0-9]+)?) *(mm|cm|m)", length.strip())
+    if found is None:
+        raise InputError(f"length {length!r}: use a number with its unit, such as 10mm or 0.01m")
+    return float(found[1]) * _METRES[found[2]]
 
 
 def write_config(config: Any, path: Path) -> None:

@@ -8,7 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.messages import Forget, Forgotten, GraspReply, GraspRequest, Health, SeedReply
+from services.messages import (
+    Forget,
+    Forgotten,
+    GraspReply,
+    GraspRequest,
+    Health,
+    SeedReply,
+    ToolPose,
+    ToolSnap,
+)
 from suturetrack.camera import Camera, StereoRig
 from suturetrack.types import (
     Energies,
@@ -156,6 +165,21 @@ def _grasp_reply(reply: GraspReply) -> None:
         _grasp(reply.grasp)
 
 
+def _tool_pose(pose: ToolPose) -> None:
+    check_name(pose.tool, "tool")
+    _require(0 <= pose.time_ns <= LARGEST_TIME, f"time_ns {pose.time_ns}")
+    _numbers(pose.position, (3,), "position")
+    _numbers(pose.rotation, (3, 3), "rotation")
+    _rotation(pose.rotation, "rotation")
+
+
+def _tool_snap(snap: ToolSnap) -> None:
+    _stamp(snap.stamp)
+    check_name(snap.tool, "tool")
+    _numbers(snap.tip, (3,), "tip")
+    _require(np.isfinite(snap.point or ()).all(), "a point that is not finite")
+
+
 def _health(health: Health) -> None:
     check_name(health.process, "process")
     _require(0 <= health.time_ns <= LARGEST_TIME, f"time_ns {health.time_ns}")
@@ -209,6 +233,8 @@ _CHECKS: dict[type[Any], Any] = {
     GraspRequest: _grasp_request,
     GraspReply: _grasp_reply,
     Stamp: _stamp,
+    ToolPose: _tool_pose,
+    ToolSnap: _tool_snap,
     Health: _health,
     StereoRig: _rig,
     type(None): _anything,

@@ -55,6 +55,9 @@ VERBS = {
     "router": _Verb("services.router", "RouterConfig", "pass messages between hosts"),
     "keys": _Verb("services.keys", "KeysConfig", "certificates and access rules for several hosts"),
     "console": _Verb("services.console", "ConsoleConfig", "the operator's page: watch and seed"),
+    "tooltip": _Verb(
+        "services.tooltip", "TooltipConfig", "the process that lets the tip of a tool seed", True
+    ),
     "scenes": _Verb("services.scenes", "ScenesConfig", "pictures of the synthetic bench top"),
     "bench": _Verb("services.bench", "BenchConfig", "accuracy and speed beside references"),
     "source": _Verb("services.source", "SourceConfig", "the process that releases frames", True),

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,7 @@ from services.bus import DEPTH, Bus, NoAnswer, Reader
 from services.checks import check, check_name
 from services.freshness import Freshness
 from services.inbox import Inbox
-from services.messages import Forget, GraspRequest, SeedReply
+from services.messages import Forget, GraspRequest, SeedReply, ToolPose
 from services.topics import Question
 from services.zenoh_transport import ZenohTransport, load_config, local_config
 from suturetrack.camera import StereoRig
@@ -38,7 +39,7 @@ from suturetrack.grasping import AWAY_FROM_CAMERA, GraspPoint
 from suturetrack.initialization import InitializationError
 from suturetrack.snapping import point_of_right_pixel
 from suturetrack.tracking.tracker import FORGOTTEN
-from suturetrack.types import Grasp, InputError, RidgeField, Seed, ThreadState
+from suturetrack.types import Float64, Grasp, InputError, RidgeField, Seed, ThreadState
 
 Q = TypeVar("Q")
 A = TypeVar("A")
@@ -243,6 +244,20 @@ class Client:
         if reply.grasp is None:
             raise Refused(reply.reason)
         return reply.grasp
+
+    def move_tool(
+        self, position: Float64, rotation: Float64, *, trigger: bool, tool: str = "tool"
+    ) -> None:
+        """Tells where a tool is, for `suturetrack tooltip`; a trigger that is pulled seeds at its tip.
+
+        Args:
+            position: (3,) of the tool's frame in the robot's base frame, m.
+            rotation: (3, 3) columns x, y, z of the tool's frame in the base frame.
+            trigger: whether it is held.
+            tool: name.
+        """
+        pose = ToolPose(tool, time.time_ns(), position, rotation, trigger)
+        self.bus.publish(topics.TOOL, pose)
 
     def calibration(self) -> StereoRig:
         """The cameras, in the calibration's own unit; raises Unavailable."""

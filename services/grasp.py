@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 from collections.abc import Iterator
@@ -11,11 +10,10 @@ from pathlib import Path
 
 from scipy.spatial.transform import Rotation
 
+from services.arguments import metres
 from services.client import Client, Refused, Seen, connect
 from suturetrack.grasping import AWAY_FROM_CAMERA
-from suturetrack.types import Grasp, InputError
-
-_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+from suturetrack.types import Grasp
 
 
 @dataclass(frozen=True)
@@ -73,14 +71,6 @@ def run(config: GraspConfig) -> None:
             except Refused as refusal:
                 line = f"frame {seen.state.stamp.frame}  refused: {refusal}"
             _show(line)
-
-
-def metres(length: str) -> float:
-    """A length with its unit, such as `10mm`, in metres; raises InputError."""
-    found = re.fullmatch(r"([-+]?[0-9]*\.?[0-9]+(?:e-?[0-9]+)?) *(mm|cm|m)", length.strip())
-    if found is None:
-        raise InputError(f"length {length!r}: use a number with its unit, such as 10mm or 0.01m")
-    return float(found[1]) * _METRES[found[2]]
 
 
 def _newest(client: Client, thread: str) -> Iterator[Seen]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from suturetrack.grasping import AWAY_FROM_CAMERA, GraspPoint
-from suturetrack.types import Grasp, Nurbs, Stamp
+from suturetrack.types import Float64, Grasp, Nurbs, Stamp
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,37 @@ class GraspRequest:
     """In metres."""
     approach: tuple[float, float, float] = AWAY_FROM_CAMERA
     """Direction in which the gripper moves in, rectified left frame; any length."""
+
+
+@dataclass(frozen=True, eq=False)
+class ToolPose:
+    """Where a tool is, as its robot knows it; whoever moves the tool publishes it."""
+
+    tool: str
+    """Name of the tool."""
+    time_ns: int
+    """Wall clock of the pose."""
+    position: Float64
+    """(3,) of the tool's frame, in metres, in the robot's base frame."""
+    rotation: Float64
+    """(3, 3) columns x, y, z of the tool's frame in the base frame."""
+    trigger: bool = False
+    """Whether the operator holds the trigger; a thread is seeded when it goes from False to True."""
+
+
+@dataclass(frozen=True, eq=False)
+class ToolSnap:
+    """What a trigger at this moment would seed."""
+
+    stamp: Stamp
+    """Of the field in which the thread was looked for."""
+    tool: str
+    tip: Float64
+    """(3,) of the tool, in metres, in the rectified left camera."""
+    point: tuple[float, float, float] | None
+    """The nearest point on a thread, in metres; None without one near enough."""
+    reason: str
+    """How far it is, why there is none, or what became of a seed, in words."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,16 @@ import re
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, TypeVar
 
-from services.messages import Forget, Forgotten, GraspReply, GraspRequest, Health, SeedReply
+from services.messages import (
+    Forget,
+    Forgotten,
+    GraspReply,
+    GraspRequest,
+    Health,
+    SeedReply,
+    ToolPose,
+    ToolSnap,
+)
 from suturetrack.camera import StereoRig
 from suturetrack.types import RidgeField, Seed, Stamp, StereoFrame, ThreadState, Truth
 
@@ -62,7 +71,9 @@ SEEDING = Topic(
 )
 STEP = Topic("step", Stamp, "tracker", "every", "the tracker is done with this frame", "segmenter")
 HEALTH = Topic("health/{process}", Health, "*", "every", "heartbeat, once a second")
-TOPICS: tuple[Topic[Any], ...] = (FRAME, FIELD, STATE, TRUTH, SEEDING, STEP, HEALTH)
+TOOL = Topic("tool/{tool}/pose", ToolPose, "client", "every", "where a tool is, and its trigger")
+SNAP = Topic("tool/{tool}/snap", ToolSnap, "tooltip", "every", "the thread at the tip of a tool")
+TOPICS: tuple[Topic[Any], ...] = (FRAME, FIELD, STATE, TRUTH, SEEDING, STEP, TOOL, SNAP, HEALTH)
 
 CALIBRATION: Question[None, StereoRig] = Question(
     "calibration", type(None), StereoRig, "source", "the rig behind the frames"

@@ -18,7 +18,16 @@ import msgspec
 import numpy as np
 
 from services import checks
-from services.messages import Forget, Forgotten, GraspReply, GraspRequest, Health, SeedReply
+from services.messages import (
+    Forget,
+    Forgotten,
+    GraspReply,
+    GraspRequest,
+    Health,
+    SeedReply,
+    ToolPose,
+    ToolSnap,
+)
 from suturetrack.camera import StereoRig
 from suturetrack.types import (
     Grasp,
@@ -53,6 +62,8 @@ _SMALL: dict[type[Any], str] = {
     GraspRequest: "grasp-request/1",
     GraspReply: "grasp-reply/1",
     Stamp: "stamp/1",
+    ToolPose: "tool-pose/1",
+    ToolSnap: "tool-snap/1",
     Health: "health/1",
     StereoRig: "rig/1",
     type(None): "nothing/1",

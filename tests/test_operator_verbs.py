@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from services import cli
-from services.grasp import metres
+from services.arguments import metres
 from suturetrack.types import InputError
 
 

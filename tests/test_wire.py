@@ -22,6 +22,8 @@ from services.messages import (
     Health,
     Latency,
     SeedReply,
+    ToolPose,
+    ToolSnap,
 )
 from services.wire import Packet, WireError
 from suturetrack.camera import StereoRig
@@ -88,6 +90,9 @@ MESSAGES: list[Any] = [
     SeedReply("0", True, "found 175 mm", STAMP, curve()),
     SeedReply("0", False, "no ridge there", candidates=((1.0, 2.0), (3.0, 4.0))),
     Grasp(STAMP, "0", np.ones(3), np.eye(3), 1e-4),
+    ToolPose("needle", 99, np.ones(3), np.eye(3), True),
+    ToolSnap(STAMP, "needle", np.ones(3), (0.1, 0.2, 0.3), "2.0 mm away"),
+    ToolSnap(STAMP, "needle", np.ones(3), None, "no thread within 8 mm"),
     Forget("0"),
     Forgotten("0", True),
     GraspRequest("0", GraspPoint(from_end=0.01)),
@@ -279,6 +284,10 @@ def with_points(value: float) -> Nurbs:
         GraspRequest("0", GraspPoint(from_end=math.nan)),
         GraspRequest("0", GraspPoint(fraction=0.5), (0.0, 0.0, 0.0)),
         GraspRequest("0", GraspPoint(fraction=0.5), (0.0, math.nan, 1.0)),
+        ToolPose("a b", 99, np.ones(3), np.eye(3)),
+        ToolPose("needle", 99, np.ones(3), 2 * np.eye(3)),
+        ToolPose("needle", 99, np.full(3, math.nan), np.eye(3)),
+        ToolSnap(STAMP, "needle", np.ones(3), (0.1, math.inf, 0.3), ""),
         GraspReply("0", None),
         GraspReply("0", Grasp(STAMP, "0", np.full(3, np.inf), np.eye(3), 0.1)),
         Truth(STAMP, "0", np.ones((4, 3)), 0.2, np.ones(5, bool)),
