@@ -84,9 +84,10 @@ def examine(config: DoctorConfig) -> Iterator[Finding]:
         yield from certificates(config.zenoh)
     watches = watch_rigs(config.rig, config.zenoh, _LISTEN_S)
     try:
-        if not any(watch.health for watch in watches.values()):
+        running = [watch for watch in watches.values() if watch.health]
+        if not running:
             yield Finding(OK, "running system", "none")
-        for watch in watches.values():
+        for watch in running:
             yield from _system(watch)
     finally:
         for watch in watches.values():
