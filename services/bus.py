@@ -84,7 +84,8 @@ class Reader(Generic[T]):
         self.topic = topic
         self._bus = bus
         self._inbox: Inbox[tuple[str, Packet, int]] = Inbox(bus.stop, depth)
-        self._next: dict[tuple[str, str], int] = {}
+        self.expected: dict[tuple[str, str], int] = {}
+        """Number of the next message, by key and publisher."""
         self.arrived_ns = 0
         """When the message that was read last had arrived, by `time.monotonic_ns`."""
         self.lost = 0
@@ -96,6 +97,11 @@ class Reader(Generic[T]):
     def passed_over(self) -> int:
         """Messages that had to make room for newer ones."""
         return self._inbox.given_up
+
+    @property
+    def waiting(self) -> int:
+        """Messages that have arrived and were not read yet."""
+        return len(self._inbox)
 
     @property
     def dropped(self) -> int:
@@ -110,13 +116,13 @@ class Reader(Generic[T]):
             self.refuse(f"{key}: {error}")
             return
         sender = (key, header.publisher)
-        if len(self._next) >= _MOST_PUBLISHERS and sender not in self._next:
-            self._next.clear()
-        gap = max(0, header.number - self._next.get(sender, header.number))
+        if len(self.expected) >= _MOST_PUBLISHERS and sender not in self.expected:
+            self.expected.clear()
+        gap = max(0, header.number - self.expected.get(sender, header.number))
         if gap and self.topic.keep == "every":
             self._bus.complain(f"{gap} messages on {key} were lost on the way")
         self.lost += gap
-        self._next[sender] = header.number + 1
+        self.expected[sender] = header.number + 1
         self._inbox.put((key, packet, time.monotonic_ns()))
 
     def get(self, timeout: float | None = None) -> T | None:

@@ -48,6 +48,9 @@ class Inbox(Generic[T]):
         self.given_up = 0
         """Messages that had to make room for newer ones."""
 
+    def __len__(self) -> int:
+        return len(self._items)
+
     def put(self, item: T) -> None:
         """Adds a message; never waits for the reader."""
         with self._stop.condition:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import suppress
+from pathlib import Path
 
 from services import cli  # first, as it keeps the libraries to one thread
 
@@ -25,6 +27,8 @@ def main() -> None:
     )
     segmenter.warm_up(rig, segmenter.SegmenterConfig())
     tracker.warm_up(rig, tracker.TrackerConfig())
+    with suppress(OSError):
+        Path("/proc/self/comm").write_text("spare")
     line = sys.stdin.readline()
     if line:
         sys.argv[1:] = json.loads(line)

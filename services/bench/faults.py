@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from services.bench import report
-from services.bench.system import ROLES, System, private_folder, rig_name
+from services.bench.system import ROLES, System, film, private_folder, rig_name
 from services.freshness import PERIODS
 from suturetrack.types import InputError
 
@@ -28,7 +28,8 @@ Kind = Literal["killed", "stopped", "hung", "silent"]
 _SEIZE, _INTERRUPT, _DETACH, _WALL = 0x4206, 0x4207, 17, 0x40000000
 _MOST_S = 2.0
 """How long a view may stay live before the injection counts as never noticed."""
-_SCENE = ("--source", "stage:figure8-175", "--loop", "30")
+_FRAMES = 20
+"""Of the film that is shown there and back."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +83,10 @@ def run(config: FaultsBench, console: Console) -> list[Row]:
     cases = [(kind, process) for kind in config.kinds for process in config.processes]
     chance = random.Random(config.seed)
     table = []
-    options = [*_SCENE, "--fps", f"{config.fps:g}", "--restarts", "100000"]
     with private_folder() as folder, Progress(console=console, transient=True) as progress:
         task = progress.add_task("Faults", total=len(cases) * config.repeats)
+        options = film(Path(folder) / "film", _FRAMES, config.fps)
+        options += ["--restarts", "1000000"]
         with System(rig_name("faults"), options, Path(folder)) as system:
             system.until_tracking()
             for kind, process in cases:
@@ -107,6 +109,8 @@ def inject(
 ) -> None:
     """One fault at a random moment, until the consumer has a live view of a tracked thread again."""
     _idle(system, chance.uniform(0.2, 0.5))
+    if kind == "killed":
+        system.until_prepared()
     pid = system.pid(process)
     assert pid is not None
     with _faulty(kind, pid):

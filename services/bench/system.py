@@ -14,12 +14,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
+import cv2
 import psutil
 
 from services.client import Seen, connect
+from suturetrack.calibration import save_calibration
+from suturetrack.stage import open_scene
 from suturetrack.types import InputError, Status
 
 ROLES = ("source", "segmenter", "tracker")
+SPARE = "spare"
 START_S = 60.0
 _POLL_S = 0.0005
 
@@ -52,6 +56,11 @@ class System:
         self.stop()
 
     @property
+    def launcher(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    @property
     def said(self) -> str:
         """What the launcher has printed."""
         return self._log.read_text()
@@ -65,12 +74,17 @@ class System:
 
     def processes(self) -> dict[str, psutil.Process]:
         """The processes of the dataflow that run now, by name."""
-        return named(psutil.Process(self._process.pid))
+        found = named(psutil.Process(self.launcher))
+        return {name: process for name, process in found.items() if name in ROLES}
 
     def pid(self, process: str) -> int | None:
         """Process id of one of them; None while it is dead."""
         found = self.processes().get(process)
         return None if found is None else found.pid
+
+    def until_prepared(self) -> None:
+        """Waits for a process in waiting, which takes the next dead one's place."""
+        self.until(lambda: SPARE in named(psutil.Process(self.launcher)))
 
     def until(self, condition: Callable[[], object], seconds: float = START_S) -> float:
         """Waits for a condition; the seconds it took. Raises InputError when it never comes true."""
@@ -88,17 +102,31 @@ class System:
         return self.until(lambda: is_tracking(self.client.latest()))
 
 
+def film(folder: Path, frames: int, fps: float, scenario: str = "figure8-175") -> list[str]:
+    """Films the bench top into a folder of pairs; the options of a run that shows them without end."""
+    scene = open_scene(scenario)
+    for side in ("left", "right"):
+        (folder / side).mkdir(parents=True)
+    for i in range(frames):
+        for side, image in zip(("left", "right"), scene.render(i), strict=True):
+            cv2.imwrite(str(folder / side / f"{i:03}.png"), image)
+    save_calibration(folder / "calibration.yaml", scene.rig)
+    u, v = scene.seed_pixel(0)
+    options = ["--source", str(folder), "--calibration", str(folder / "calibration.yaml")]
+    return [*options, "--loop", str(frames), "--fps", f"{fps:g}", "--seed", str(u), str(v)]
+
+
 def is_tracking(seen: Seen | None) -> bool:
     """Whether a consumer may act on what it sees."""
     return seen is not None and seen.live and seen.state.status is Status.TRACKING
 
 
 def named(parent: psutil.Process) -> dict[str, psutil.Process]:
-    """The processes of the dataflow among the children of a process, by name."""
+    """The processes of the dataflow and the spare among the children of a process, by name."""
     found = {}
     for child in parent.children():
         with suppress(psutil.NoSuchProcess):
-            if child.name() in ROLES and child.status() != psutil.STATUS_ZOMBIE:
+            if child.name() in (*ROLES, SPARE) and child.status() != psutil.STATUS_ZOMBIE:
                 found[child.name()] = child
     return found
 

@@ -1,0 +1,139 @@
+"""Nothing is lost in silence: what was sent is what was read, and what was counted as dropped."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from services import topics
+from services.bus import Bus, Reader
+from services.zenoh_transport import ZenohTransport, local_config, remove_sockets
+
+SENDER = """
+import sys, time
+import numpy as np
+from services import topics
+from services.bus import Bus
+from services.zenoh_transport import ZenohTransport, local_config
+from suturetrack.types import Stamp, StereoFrame
+
+flood, tail = int(sys.argv[1]), int(sys.argv[2])
+bus = Bus(ZenohTransport(local_config("test", "source")), "test", "source")
+image = np.zeros((480, 640, 3), np.uint8)
+bus.make_room(StereoFrame(Stamp(0, 0, 0), image, image))
+for topic in (topics.FRAME, topics.STEP):
+    bus.wait_for_readers(topic)
+print("begun", flush=True)
+for i in range(flood + tail):
+    stamp = Stamp(i, i, time.time_ns())
+    bus.publish(topics.FRAME, StereoFrame(stamp, image, image))
+    bus.publish(topics.STEP, stamp)
+    if i >= flood:
+        time.sleep(0.05)
+print(i + 1, flush=True)
+sys.stdin.read()
+bus.close()
+"""
+
+
+def start_sender(flood: int, tail: int = 20) -> subprocess.Popen[str]:
+    """A process that floods with VGA stereo frames and small messages, then sends a few slowly."""
+    pipe = subprocess.PIPE
+    command = [sys.executable, "-c", SENDER, str(flood), str(tail)]
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+
+
+class Consumer:
+    """Reads a topic at its own pace, and counts."""
+
+    def __init__(self, reader: Reader[Any], pause_s: float | None):
+        self.reader, self.read = reader, 0
+        if pause_s is not None:
+            threading.Thread(target=self._loop, args=(pause_s,), daemon=True).start()
+
+    def _loop(self, pause_s: float) -> None:
+        for _ in self.reader:
+            self.read += 1
+            time.sleep(pause_s)
+
+    def accounted(self) -> int:
+        """Messages of which it is known what became of them."""
+        reader = self.reader
+        return self.read + reader.passed_over + reader.lost + reader.refused + reader.waiting
+
+
+@contextmanager
+def consumers() -> Iterator[list[Consumer]]:
+    """One that keeps up, a slow one and one that stands still, for frames and for small messages."""
+    buses = [Bus(ZenohTransport(local_config("test", n)), "test", n) for n in ("tracker", "viewer")]
+    keeping_up, other = buses
+    yield [
+        Consumer(keeping_up.newest(topics.FRAME), 0.0),
+        Consumer(other.newest(topics.FRAME), 0.05),
+        Consumer(other.newest(topics.FRAME), None),
+        Consumer(keeping_up.every(topics.STEP), 0.0),
+        Consumer(other.every(topics.STEP), 0.01),
+        Consumer(other.every(topics.STEP), None),
+    ]
+    for bus in buses:
+        bus.close()
+    remove_sockets("test")
+
+
+def until(condition: Callable[[], bool], seconds: float = 30) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("flood", [600, pytest.param(20_000, marks=pytest.mark.long)])
+def test_sent_is_read_and_counted_drops(rig_name: str, flood: int) -> None:
+    with consumers() as all_of_them, start_sender(flood) as sender:
+        assert sender.stdout
+        assert sender.stdin
+        assert sender.stdout.readline() == "begun\n"
+        sent = int(sender.stdout.readline())
+        assert sent == flood + 20
+        for consumer in all_of_them:
+            until(lambda consumer=consumer: consumer.accounted() == sent)  # type: ignore[misc]
+        sender.stdin.close()
+        # A flood is more than the slow ones can take.
+        slow, still = all_of_them[1:3]
+        assert slow.reader.dropped > 100
+        assert still.reader.dropped == sent - 1
+        assert [consumer.read > 0 for consumer in all_of_them] == [True, True, False] * 2
+
+
+@pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.long)])
+def test_nothing_is_silent_while_senders_are_killed(rig_name: str, kills: int) -> None:
+    """What a dying process took with it, nobody can count; up to its last message nothing is missing."""
+    chance = random.Random(0)
+    with consumers() as all_of_them:
+        for _ in range(kills):
+            with start_sender(10**9) as sender:
+                assert sender.stdout
+                assert sender.stdout.readline() == "begun\n"
+                before = all_of_them[3].read
+                until(lambda before=before: all_of_them[3].read > before + 20)  # type: ignore[misc]
+                time.sleep(chance.uniform(0, 0.05))
+                sender.kill()
+        with start_sender(0) as sender:
+            assert sender.stdout
+            assert sender.stdin
+            assert sender.stdout.readline() == "begun\n"
+            assert sender.stdout.readline() == "20\n"
+            for consumer in all_of_them:
+                # By now the last of every sender's messages has arrived.
+                until(lambda c=consumer: c.accounted() == sum(c.reader.expected.values()))  # type: ignore[misc]
+                assert len(consumer.reader.expected) == kills + 1
+                assert min(consumer.reader.expected.values()) >= 20
+            sender.stdin.close()
