@@ -202,7 +202,7 @@ class _Look:
     """Whether the weights are those of channels divided by their means."""
     sigmas: tuple[float, ...]
     signs: tuple[float, float]
-    """See `ridge.ridge_vectors`."""
+    """See `ridge.ridge_field`."""
     across: Float64 | None = None
     """(threads, 3) of `Contrast.across`; None until a thread is learned."""
 
@@ -259,7 +259,6 @@ class _View:
         self._config = config
         self._kernel = gaussian_kernel(config.blur)
         self._channels = [np.empty((height, width), np.uint8) for _ in range(3)]
-        self._vectors = np.empty((2, height, width + 4), np.float32)
         self._strength = np.empty(((height + 3) // 4, width), np.float32)
         self._outputs = np.empty((_SLOTS, height, width, 2), np.float32)
         self._relative_c: float | None = None
@@ -281,33 +280,24 @@ class _View:
 
     def filter(self, plane: Float32, look: _Look, slot: int) -> Float32:
         """Eq. (1) and Algorithm 1 on the rectified plane, into the slot's buffer."""
-        c = self._config.c or self._c
+        out, c = self._outputs[slot], self._config.c or self._c
         if c is None:
-            self._find_ridges_by_their_quantile(plane, look)
+            self._find_ridges_by_their_quantile(plane, look, out)
         else:
-            self._find_ridges(plane, look, c)
-        ridge.blur_angles(self._vectors, self._kernel, self._outputs[slot])
-        return self._outputs[slot]
+            self._find_ridges(plane, look, c, out)
+        return out
 
-    def _find_ridges_by_their_quantile(self, plane: Float32, look: _Look) -> None:
+    def _find_ridges_by_their_quantile(self, plane: Float32, look: _Look, out: Float32) -> None:
         if self._relative_c is None:
-            self._find_ridges(plane, look, _LEAST_C)
+            self._find_ridges(plane, look, _LEAST_C, out)
             self._relative_c = self._automatic_c() / self._brightness
-        self._find_ridges(plane, look, max(self._relative_c * self._brightness, _LEAST_C))
+        self._find_ridges(plane, look, max(self._relative_c * self._brightness, _LEAST_C), out)
         self._relative_c += _PULL * (self._automatic_c() / self._brightness - self._relative_c)
 
-    def _find_ridges(self, plane: Float32, look: _Look, c: float) -> None:
+    def _find_ridges(self, plane: Float32, look: _Look, c: float, out: Float32) -> None:
         shape = 0.5 / self._config.beta**2, 0.5 / c**2
-        for i, sigma in enumerate(look.sigmas):
-            ridge.ridge_vectors(
-                plane,
-                ridge.gaussian_taps(sigma),
-                shape,
-                look.signs,
-                i > 0,
-                self._vectors,
-                self._strength,
-            )
+        taps = ridge.taps_of(look.sigmas)
+        ridge.ridge_field(plane, *taps, shape, look.signs, self._kernel, out, self._strength)
 
     def _automatic_c(self) -> float:
         return max(math.sqrt(ridge.quantile(self._strength, 0.998)) / 2, _LEAST_C)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from suturetrack.types import Float32, Image
 
@@ -47,49 +48,85 @@ def mix_channels(blue: Image, green: Image, red: Image, weights: Float32, plane:
             target[x] = weights[0] * b[x] + weights[1] * g[x] + weights[2] * r[x]
 
 
+@cache
+def taps_of(sigmas: tuple[float, ...]) -> tuple[Float32, NDArray[np.int64]]:
+    """(k, 3, r + 1) `gaussian_taps` of k scales, filled up with zeros, and (k,) their own radii."""
+    every = [gaussian_taps(sigma) for sigma in sigmas]
+    radii = np.array([taps.shape[1] - 1 for taps in every])
+    largest = radii.max()
+    return np.array([np.pad(t, [(0, 0), (0, largest + 1 - t.shape[1])]) for t in every]), radii
+
+
 @njit(cache=True, **_fast)
-def ridge_vectors(
+def ridge_field(
     plane: Float32,
     taps: Float32,
+    radii: NDArray[np.int64],
     shape: tuple[float, float],
     signs: tuple[float, float],
-    keep_longer: bool,
-    vectors: Float32,
+    kernel: Float32,
+    out: Float32,
     strength: Float32,
 ) -> None:
-    """Eq. (1): V_r of every pixel of `plane`, edges replicated.
+    """Eq. (1) and Algorithm 1 for every pixel of `plane`, edges replicated.
 
     Args:
         plane: (H, W).
-        taps: of `gaussian_taps`.
+        taps: with `radii`, of `taps_of`; of several scales the longest vector counts.
         shape: (1 / (2 beta^2), 1 / (2 c^2)).
         signs: lambda_2 / |lambda_2| must lie in this closed range: (1, 1) finds dark ridges,
             (-1, -1) bright ones, (-1, 1) both.
-        keep_longer: whether a vector that `vectors` holds already stays where it is the longer one.
-        vectors: (2, H, W + 4), written: u and v, and two replicated columns on both sides.
+        kernel: (5, 5), G.
+        out: (H, W, 2), written: V_o.
         strength: (ceil(H / 4), W), written: S^2 of every fourth row, 0 where the sign is refused.
     """
     height, width = plane.shape
-    radius = taps.shape[1] - 1
-    smooth, slope, curve = taps[0], taps[1], taps[2]
-    ring = np.empty((2 * radius + 1, width), np.float32)
+    radius = taps.shape[2] - 1
+    rings = np.empty((len(taps), 2 * radius + 1, width), np.float32)
     padded = np.empty((3, width + 2 * radius), np.float32)
     hessian = np.empty((3, width), np.float32)
-    for y in range(-radius, height + radius):
-        _pad(plane[min(max(y, 0), height - 1)], radius, padded[0])
-        _second_difference(padded[0], curve, ring[(y + radius) % len(ring)])
-        row = y - radius
-        if row < 0:
-            continue
-        _smooth_ring(ring, row + radius, smooth, hessian[0])
-        _vertical_derivatives(plane, row, slope, curve, padded[1:])
-        _smooth_row(padded[2], smooth, hessian[2])
-        _first_difference(padded[1], slope, hessian[1])
-        u, v = vectors[0, row, 2:], vectors[1, row, 2:]
-        _ridge_row(hessian, shape, signs, keep_longer, u, v, strength[row // 4])
-        for line in vectors[:, row]:
-            line[0] = line[1] = line[2]
-            line[width + 2] = line[width + 3] = line[width + 1]
+    vectors = np.empty((2, 5, width + 4), np.float32)
+    sums = np.empty((2, width), np.float32)
+    for row in range(height + 2):
+        if row < height:
+            u, v = vectors[0, row % 5], vectors[1, row % 5]
+            for scale in range(len(taps)):
+                ring = rings[scale, : 2 * radii[scale] + 1]
+                _hessian_row(plane, row, taps[scale], radii[scale], ring, padded, hessian)
+                _ridge_row(hessian, shape, signs, scale > 0, u[2:], v[2:], strength[row // 4])
+            for line in (u, v):
+                line[0] = line[1] = line[2]
+                line[width + 2] = line[width + 3] = line[width + 1]
+        if row >= 2:
+            blur_row(vectors, row - 2, height, kernel, sums, out[row - 2])
+
+
+@njit(cache=True, **_fast)
+def _hessian_row(
+    plane: Float32,
+    row: int,
+    taps: Float32,
+    radius: int,
+    ring: Float32,
+    padded: Float32,
+    hessian: Float32,
+) -> None:
+    """Second derivatives in one row; `ring` keeps those along u of the rows around it."""
+    height, width = plane.shape
+    smooth, slope, curve = (
+        taps[0, : radius + 1],
+        taps[1, : radius + 1],
+        taps[2, : radius + 1],
+    )
+    size = width + 2 * radius
+    line, first, second = padded[0, :size], padded[1, :size], padded[2, :size]
+    for y in range(row + radius if row else -radius, row + radius + 1):
+        _pad(plane[min(max(y, 0), height - 1)], radius, line)
+        _second_difference(line, curve, ring[(y + radius) % len(ring)])
+    _smooth_ring(ring, row + radius, smooth, hessian[0])
+    _vertical_derivatives(plane, row, slope, curve, first, second)
+    _smooth_row(second, smooth, hessian[2])
+    _first_difference(first, slope, hessian[1])
 
 
 @njit(cache=True, **_fast)
@@ -157,32 +194,43 @@ def _smooth_ring(ring: Float32, row: int, taps: Float32, out: Float32) -> None:
     centre = ring[row % size]
     for x in range(len(out)):
         out[x] = taps[0] * centre[x]
-    for k in range(1, len(taps), 2):
+    for k in range(1, len(taps), 4):
         a0, a1 = ring[(row - k) % size], ring[(row - k - 1) % size]
+        a2, a3 = ring[(row - k - 2) % size], ring[(row - k - 3) % size]
         b0, b1 = ring[(row + k) % size], ring[(row + k + 1) % size]
-        t0, t1 = taps[k], taps[k + 1]
+        b2, b3 = ring[(row + k + 2) % size], ring[(row + k + 3) % size]
+        t0, t1, t2, t3 = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
         for x in range(len(out)):
-            out[x] += t0 * (a0[x] + b0[x]) + t1 * (a1[x] + b1[x])
+            near = t0 * (a0[x] + b0[x]) + t1 * (a1[x] + b1[x])
+            far = t2 * (a2[x] + b2[x]) + t3 * (a3[x] + b3[x])
+            out[x] = out[x] + near + far
 
 
 @njit(cache=True, **_fast)
 def _vertical_derivatives(
-    plane: Float32, row: int, slope: Float32, curve: Float32, padded: Float32
+    plane: Float32,
+    row: int,
+    slope: Float32,
+    curve: Float32,
+    padded_first: Float32,
+    padded_second: Float32,
 ) -> None:
     height, width = plane.shape
     radius = len(slope) - 1
     centre = plane[row]
-    first, second = padded[0, radius:], padded[1, radius:]
+    first, second = padded_first[radius:], padded_second[radius:]
     for x in range(width):
         first[x] = second[x] = _zero
-    for k in range(1, radius + 1):
-        above, below = plane[max(row - k, 0)], plane[min(row + k, height - 1)]
-        tap1, tap2 = slope[k], curve[k]
+    for k in range(1, radius + 1, 2):
+        a0, b0 = plane[max(row - k, 0)], plane[min(row + k, height - 1)]
+        a1, b1 = plane[max(row - k - 1, 0)], plane[min(row + k + 1, height - 1)]
+        s0, s1, c0, c1 = slope[k], slope[k + 1], curve[k], curve[k + 1]
         for x in range(width):
-            up, down = above[x] - centre[x], below[x] - centre[x]
-            first[x] += tap1 * (down - up)
-            second[x] += tap2 * (up + down)
-    for line in padded:
+            up0, down0 = a0[x] - centre[x], b0[x] - centre[x]
+            up1, down1 = a1[x] - centre[x], b1[x] - centre[x]
+            first[x] = first[x] + s0 * (down0 - up0) + s1 * (down1 - up1)
+            second[x] = second[x] + c0 * (up0 + down0) + c1 * (up1 + down1)
+    for line in (padded_first, padded_second):
         for x in range(radius):
             line[x] = line[radius]
             line[radius + width + x] = line[radius + width - 1]
@@ -239,29 +287,31 @@ def _decay(x: Any) -> Any:
 
 
 @njit(cache=True, **_fast)
-def blur_angles(vectors: Float32, kernel: Float32, out: Float32) -> None:
-    """Algorithm 1, taps in raster order, edges replicated.
+def blur_row(
+    vectors: Float32, row: int, height: int, kernel: Float32, sums: Float32, out: Float32
+) -> None:
+    """Algorithm 1 for one row, taps in raster order, edges replicated.
 
     Args:
-        vectors: (2, H, W + 4), V_r and two replicated columns on both sides.
+        vectors: (2, n, W + 4), V_r and two replicated columns on both sides; row y at y % n.
+        row: the row.
+        height: of the image.
         kernel: (5, 5), G.
-        out: (H, W, 2), written: V_o.
+        sums: (2, W), overwritten.
+        out: (W, 2), written: V_o.
     """
-    height, width, _ = out.shape
-    sums = np.empty((2, width), np.float32)
-    for row in range(height):
-        for axis in range(2):
-            centre, total = vectors[axis, row, 2:], sums[axis]
-            for x in range(width):
-                total[x] = kernel[2, 2] * centre[x]
-        for k in range(5):
-            beside = min(max(row + k - 2, 0), height - 1)
-            u, v = vectors[0, beside], vectors[1, beside]
-            _add_taps(u, v, kernel[k], k == 2, sums[0], sums[1])
-        line, u, v = out[row], sums[0], sums[1]
+    kept, width = vectors.shape[1], len(out)
+    for axis in range(2):
+        centre, total = vectors[axis, row % kept, 2:], sums[axis]
         for x in range(width):
-            line[x, 0] = u[x]
-            line[x, 1] = v[x]
+            total[x] = kernel[2, 2] * centre[x]
+    for k in range(5):
+        beside = min(max(row + k - 2, 0), height - 1) % kept
+        u, v = vectors[0, beside], vectors[1, beside]
+        _add_taps(u, v, kernel[k], k == 2, sums[0], sums[1])
+    for x in range(width):
+        out[x, 0] = sums[0, x]
+        out[x, 1] = sums[1, x]
 
 
 @njit(cache=True, **_exact)
