@@ -14,6 +14,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from services.cli import call
 from services.sources import InputConfig, open_input
 from services.sources.pairing import Pairing, stereo_topics
 from services.sources.ros_image import CAMERA_INFO, COMPRESSED, IMAGE, decode
@@ -383,3 +384,19 @@ def test_each_image_gets_the_partner_nearest_in_time() -> None:
     assert [p for p in pairs if p] == [(200, 200, 205), (300, 300, 309)]
     assert pairing.unpaired == 1
     assert pairing.closest_ns == 5
+
+
+def test_bad_input_ends_with_one_line_and_an_exit_status(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"junk")
+    for arguments in (
+        ["run", "--source", f"{tmp_path / 'a.mcap'}"],
+        ["run", "--source", f"{tmp_path / 'missing.bag'}"],
+        ["run", "--source", "ros2:/left/image_raw"],
+        ["calibration", "check", f"{tmp_path / 'a.mcap'}"],
+    ):
+        assert call(arguments) == 1
+        said = capsys.readouterr().err
+        assert said.startswith(f"suturetrack {arguments[0]}: ")
+        assert said.count("\n") == 1

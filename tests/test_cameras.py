@@ -34,6 +34,7 @@ class Devices:
         self.gone = threading.Event()
         self.opened = 0
         self.open_now = 0
+        self.asked: dict[str | int, dict[int, float]] = {}
 
     def capture(self, name: str | int) -> FakeCapture:
         return FakeCapture(self, name)
@@ -54,6 +55,9 @@ class FakeCapture:
 
     def get(self, what: int) -> float:
         return 100.0 if what == cv2.CAP_PROP_FPS else 0.0
+
+    def set(self, what: int, value: float) -> None:
+        self._devices.asked.setdefault(self._name, {})[what] = value
 
     def grab(self) -> bool:
         time.sleep(0.01)
@@ -110,6 +114,10 @@ def test_one_side_by_side_camera_and_two_cameras(
         assert abs(time.time_ns() - exposure.capture_ns) < 10e9
     footage.close()
     assert devices.open_now == 0
+    asked = devices.asked[0]
+    assert asked[cv2.CAP_PROP_FRAME_WIDTH] == (WIDTH if pair else 2 * WIDTH)
+    assert asked[cv2.CAP_PROP_FRAME_HEIGHT] == HEIGHT
+    assert asked[cv2.CAP_PROP_FPS] == 30
 
 
 def test_a_camera_that_stalls_is_told_and_comes_back(devices: Devices, calibration: Path) -> None:
@@ -137,7 +145,10 @@ def test_a_camera_that_gives_nothing_or_the_wrong_thing_is_refused(
 ) -> None:
     devices.images = {0: both(1)}
     with pytest.raises(InputError, match="camera 5: cannot be opened; is it there"):
-        open_input(InputConfig("5", calibration))
+        open_input(InputConfig("0,5", calibration))
+    assert devices.open_now == 0
+    with pytest.raises(InputError, match="--calibration FILE is needed"):
+        open_input(InputConfig("0"))
     devices.images[1] = picture(0, 0)[:200]
     with pytest.raises(InputError, match=r"left is \(240, 640, 3\), right is \(200, 320, 3\)"):
         open_input(InputConfig("0,1", calibration))

@@ -52,7 +52,8 @@ class InputConfig:
     ros: RosConfig = field(default_factory=RosConfig)
     """Where the ROS 2 graph is."""
     fps: float = 30.0
-    """Frames a second of folders and of the bench top; videos know theirs."""
+    """Frames a second of folders and of the bench top, and what cameras are asked for; videos and bags
+    know theirs."""
     frames: int | None = None
     """Stop after so many frames."""
     loop: int | None = None
@@ -95,16 +96,18 @@ def _open(config: InputConfig) -> tuple[Footage, StereoRig]:
 def _rig_of(footage: Footage, config: InputConfig) -> StereoRig:
     ros = footage if isinstance(footage, BagFootage | Ros2Footage) else None
     rectified = config.rectified or (ros is not None and ros.rectified)
-    if config.calibration is not None:
-        rig = open_rig(config.calibration, config.unit, config.scale, rectified=rectified)
-        name = f"calibration {config.calibration}"
-    elif ros is not None:
-        rig = adapt(ros.rig(config.unit), config.scale, rectified=rectified)
-        name = "camera_info"
+    if ros is not None and config.calibration is None:
+        rig, name = adapt(ros.rig(config.unit), config.scale, rectified=rectified), "camera_info"
     else:
-        raise InputError("--calibration FILE is needed; only stage: and ROS know their own")
+        rig, name = _given_rig(config, rectified=rectified), f"calibration {config.calibration}"
     check_size(footage.size, rig, f"source {config.source}", name)
     return rig
+
+
+def _given_rig(config: InputConfig, *, rectified: bool = False) -> StereoRig:
+    if config.calibration is None:
+        raise InputError("--calibration FILE is needed; only stage: and ROS know their own")
+    return open_rig(config.calibration, config.unit, config.scale, rectified=rectified)
 
 
 def _open_stage(config: InputConfig) -> tuple[Footage, StereoRig]:
@@ -112,7 +115,7 @@ def _open_stage(config: InputConfig) -> tuple[Footage, StereoRig]:
     stage = StageFootage(name, config.scene_seed, config.scene_rig, config.fps, config.picture)
     if config.calibration is None:
         return stage, stage.rig
-    rig = open_rig(config.calibration, config.unit, config.scale, rectified=config.rectified)
+    rig = _given_rig(config, rectified=config.rectified)
     check_size(stage.size, rig, f"source {config.source}", f"calibration {config.calibration}")
     return stage, rig
 
@@ -128,7 +131,7 @@ def _open_footage(config: InputConfig) -> Footage:
     if len(parts) > 2:
         raise InputError(f"source {config.source}: at most two files or devices, LEFT,RIGHT")
     if all(is_device(part) for part in parts):
-        return CameraFootage(parts)
+        return CameraFootage(parts, _given_rig(config).image_size, config.fps)
     if len(parts) == 1 and Path(parts[0]).is_dir():
         return FolderFootage(Path(parts[0]), config.fps)
     return VideoFootage([Path(part) for part in parts])

@@ -27,6 +27,11 @@ class CameraFootage:
 
     A camera that gives no more images is closed and opened again until it does.
 
+    Args:
+        names: one side-by-side device, or the left and the right one.
+        size: (width, height) of one view, px; what the devices are asked for.
+        fps: frames a second; what they are asked for.
+
     Raises:
         InputError: a camera cannot be opened, or gives no image at all.
     """
@@ -35,12 +40,18 @@ class CameraFootage:
     frame_count: int | None = None
     seeds: tuple[tuple[float, float], ...] = ()
 
-    def __init__(self, names: list[str]):
+    def __init__(self, names: list[str], size: tuple[int, int], fps: float):
         self._names = names
+        width, height = size
+        self._wanted = {
+            cv2.CAP_PROP_FRAME_WIDTH: width * (2 if len(names) == 1 else 1),
+            cv2.CAP_PROP_FRAME_HEIGHT: height,
+            cv2.CAP_PROP_FPS: fps,
+        }
         self._newest = Newest()
         self._closing = threading.Event()
-        captures = [_open(name) for name in names]
-        self.fps = float(captures[0].get(cv2.CAP_PROP_FPS)) or 30.0
+        captures = self._open()
+        self.fps = float(captures[0].get(cv2.CAP_PROP_FPS)) or fps
         self._thread = threading.Thread(target=self._take, args=(captures,), daemon=True)
         self._thread.start()
         try:
@@ -88,7 +99,10 @@ class CameraFootage:
                 continue
             _release(captures)
             self._closing.wait(_RETRY_S)
-            captures = self._reopened()
+            try:
+                captures = self._open()
+            except InputError:
+                captures = []
         _release(captures)
 
     def _expose(self, captures: list[cv2.VideoCapture]) -> Exposure | None:
@@ -108,22 +122,19 @@ class CameraFootage:
             raise InputError(f"cameras: left is {left.shape}, right is {right.shape}")
         return Exposure(now_ns, left, right)
 
-    def _reopened(self) -> list[cv2.VideoCapture]:
+    def _open(self) -> list[cv2.VideoCapture]:
         captures: list[cv2.VideoCapture] = []
-        try:
-            for name in self._names:
-                captures.append(_open(name))
-        except InputError:
-            _release(captures)
-            return []
+        for name in self._names:
+            capture = cv2.VideoCapture(int(name) if name.isdecimal() else name)
+            captures.append(capture)
+            if not capture.isOpened():
+                _release(captures)
+                raise InputError(
+                    f"camera {name}: cannot be opened; is it there, and may you read it?"
+                )
+            for setting, value in self._wanted.items():
+                capture.set(setting, value)
         return captures
-
-
-def _open(name: str) -> cv2.VideoCapture:
-    capture = cv2.VideoCapture(int(name) if name.isdecimal() else name)
-    if not capture.isOpened():
-        raise InputError(f"camera {name}: cannot be opened; is it there, and may you read it?")
-    return capture
 
 
 def _release(captures: list[cv2.VideoCapture]) -> None:
