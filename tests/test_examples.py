@@ -1,0 +1,98 @@
+"""The example scripts, and the verbs of an operator, before a running demo."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from suturetrack.stage import open_scene
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SCENE = "figure8-107"
+
+
+@pytest.fixture(scope="module")
+def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts Python with these words, beside a running system that has no seed yet."""
+    directory = tempfile.mkdtemp(prefix="suturetrack-")
+    environment = {**os.environ, "XDG_RUNTIME_DIR": directory}
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(*words: object) -> subprocess.Popen[str]:
+        pipe = subprocess.PIPE
+        command = [sys.executable, *map(str, words)]
+        process = subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True)
+        started.append(process)
+        return process
+
+    source = ("--source", f"stage:{SCENE}", "--loop", 3, "--fps", 10)
+    for verb in (("source", *source), ("segmenter",), ("tracker",)):
+        begin("-m", "services.cli", *verb)
+    yield begin
+    for process in started:
+        process.kill()
+        process.communicate()
+    shutil.rmtree(directory, ignore_errors=True)
+
+
+def lines(process: subprocess.Popen[str], pattern: str) -> Iterator[re.Match[str]]:
+    """Those of the lines that it prints which fit; at most 400 are read."""
+    assert process.stdout is not None
+    for _, line in zip(range(400), process.stdout, strict=False):
+        found = re.search(pattern, line)
+        if found is not None:
+            yield found
+    raise AssertionError(f"no line with {pattern!r}")
+
+
+def test_the_examples_and_the_verbs_work_on_a_running_system(
+    start: Callable[..., subprocess.Popen[str]],
+) -> None:
+    u, v = (round(x) for x in open_scene(SCENE).seed_pixel(0))
+    # The first call waits until the system is ready.
+    for _ in range(30):
+        nothing = start(EXAMPLES / "seed_by_pixel.py", 5, 5)
+        out, err = nothing.communicate(timeout=60)
+        assert nothing.returncode == 1
+        if "no tracker runs" not in err:
+            break
+    assert "refused: no thread within" in out
+    assert "looks like thread: " in out
+
+    seed = start(EXAMPLES / "seed_by_pixel.py", u, v)
+    out, err = seed.communicate(timeout=60)
+    assert seed.returncode == 0, err
+    assert re.search(r"found [0-9.]+ mm", out)
+
+    watch = start(EXAMPLES / "watch_states.py")
+    frames = lines(watch, r"frame (\d+), tracking, ([0-9.]+) mm, .* 0 missed")
+    first, second = next(frames), next(frames)
+    assert int(second[1]) > int(first[1])
+    assert 30 < float(second[2]) < 130
+
+    follow = start(EXAMPLES / "follow_grasp.py")
+    next(lines(follow, r"frame \d+: move to \S+ \S+ \+\d+\.\d+ mm"))
+
+    verb = start("-m", "services.cli", "grasp", "--from-end", "10mm", "--watch")
+    next(lines(verb, r"frame \d+  position .* mm  quaternion xyzw .* sigma .* age \d+ ms"))
+    for process in (watch, follow, verb):
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+
+    again = start("-m", "services.cli", "seed", u, v, "--thread", "needle")
+    out, err = again.communicate(timeout=60)
+    assert again.returncode == 0, err
+    assert out.startswith("thread needle: found ")
+    unknown = start("-m", "services.cli", "grasp", "--fraction", 0.5, "--thread", "x")
+    _, err = unknown.communicate(timeout=60)
+    assert unknown.returncode == 1
+    assert "no thread 'x'; there is 0, needle" in err
