@@ -8,7 +8,8 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization.confidence import judge
 from suturetrack.initialization.ends import move_end, read_end
 from suturetrack.initialization.fitting import fit_marks, image_parameters, refine
-from suturetrack.initialization.growth import Chain, grow_thread, nearest_segment
+from suturetrack.initialization.growth import grow_thread, nearest_segment
+from suturetrack.initialization.hypotheses import Hypothesis, find_thread
 from suturetrack.initialization.matching import Match, match
 from suturetrack.initialization.model import (
     Growth,
@@ -52,25 +53,24 @@ def initialize(
     origin, candidates = nearest_segment(ridges[0], pixel, config.snap_px)
     if origin is None:
         raise InitializationError(_nothing_there(candidates, pixel, config), candidates)
-    chain, left = grow_thread(ridges[0], origin, pixel, config)
     nearest = float(rig.left.projection[0, 2] - rig.right.projection[0, 2])
-    matched = match(chain, field.left, field.right, nearest, 1)
-    right_chain, right = _right_growth(ridges[1], matched.pixels, config)
-    pixels = np.c_[chain.pixels, matched.pixels]
+    found = find_thread(field, ridges, origin, pixel, nearest, config)
+    pixels = found.pixels
+    growths = _growths(found, ridges[1], pixel, config)
     step = max(1, round(config.step_px))
-    growth = Growth(left, right, pixels[::step].reshape(-1, 2, 2))
-    if len(chain.pixels) < _SHORTEST_STEPS * step:
-        reason = f"the ridge at the seed is only {len(chain.pixels)} px long"
+    growth = Growth(*growths, pixels[::step].reshape(-1, 2, 2))
+    if len(pixels) < _SHORTEST_STEPS * step:
+        reason = f"the ridge at the seed is only {len(pixels)} px long"
         raise InitializationError(reason, candidates, growth)
-    if np.median(matched.response) < _LEAST_MATCH:
-        swapped = match(chain, field.left, field.right, nearest, -1)
+    if np.median(found.matched.response) < _LEAST_MATCH:
+        swapped = match(found.left.chain, field.left, field.right, nearest, -1)
         raise InitializationError(_no_match(swapped), candidates, growth)
     pixels = _trim(pixels, field)
     s = image_parameters(pixels[:, :2], pixels[:, 2:])
     points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
     curve = fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
     curve, samples = refine(curve, (field.left, field.right), rig)
-    confidence, reasons = judge(curve, samples, (chain, right_chain), rig)
+    confidence, reasons = judge(curve, samples, found.chains, rig)
     return Initialization(curve, confidence, reasons, samples.distance_px, growth)
 
 
@@ -105,16 +105,16 @@ def _trim(pixels: Float64, field: RidgeField) -> Float64:
     return pixels
 
 
-def _right_growth(
-    ridges: Ridges, pixels: Float64, config: InitializationConfig
-) -> tuple[Chain, ViewGrowth]:
-    middle = pixels[len(pixels) // 2]
-    origin, _ = nearest_segment(ridges, middle, np.inf)
-    if origin is None:
-        cost = np.full(ridges.magnitude.shape, np.inf, np.float32)
-        nothing = Chain(np.empty((0, 2)), np.empty(0, bool))
-        return nothing, ViewGrowth(cost, (), np.empty((0, 2, 2)), ())
-    return grow_thread(ridges, origin, middle, config)
+def _growths(
+    found: Hypothesis, right: Ridges, seed: Float64, config: InitializationConfig
+) -> tuple[ViewGrowth, ViewGrowth]:
+    left = grow_thread(found.left, seed, config)
+    if found.right is None:
+        cost = np.full(right.magnitude.shape, np.inf, np.float32)
+        return left, ViewGrowth(cost, (), np.empty((0, 2, 2)), ())
+    pixels = found.pixels
+    there = pixels[np.argmin(np.linalg.norm(pixels[:, :2] - seed, axis=1)), 2:]
+    return left, grow_thread(found.right, there, config)
 
 
 def _no_match(swapped: Match) -> str:

@@ -42,7 +42,7 @@ def judge(
     lowest = 1.0
     for name, chain in zip(("left", "right"), chains, strict=True):
         doubts = _distinct(chain)
-        lowest = min(lowest, _clarity(chain))
+        lowest = min(lowest, clarity(chain))
         reasons += [f"{why} in the {name} view at ({u:.0f}, {v:.0f})" for (u, v), why, _ in doubts]
     # Two views that come to the same by themselves are not both mistaken easily.
     confidence *= np.sqrt(lowest) if agreement >= _AGREED else lowest
@@ -59,7 +59,7 @@ def judge(
 _ORDINAL = ("first", "last")
 
 
-def _clarity(chain: Chain) -> float:
+def clarity(chain: Chain) -> float:
     """What the doubts about a chain leave of the confidence in it."""
     return float(np.prod([rest for *_, rest in _distinct(chain)]))
 

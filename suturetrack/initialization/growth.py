@@ -45,18 +45,43 @@ def nearest_segment(ridges: Ridges, seed: Float64, reach: float) -> tuple[int | 
     return (best if np.isfinite(score[best]) else None), candidates
 
 
-def grow_thread(
-    ridges: Ridges, origin: int, seed: Float64, config: InitializationConfig
-) -> tuple[Chain, ViewGrowth]:
-    """Grows by eq. (3) from the seed on segment `origin` and follows the merged segments."""
+@dataclass(frozen=True, eq=False)
+class Thread:
+    """Segments of one view that make a thread, from end to end."""
+
+    ridges: Ridges
+    """Of the view; segments that two strands share are doubled."""
+    entries: list[int]
+    """The end at which each segment is entered: 2i is the start of segment i, 2i + 1 its end."""
+    origin: int
+    """The segment that the seed lies on."""
+    chain: Chain
+
+    @property
+    def pieces(self) -> list[Float64]:
+        """The segments in order, each run in the direction of the thread."""
+        return [self.ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in self.entries]
+
+
+def follow_thread(ridges: Ridges, origin: int, config: InitializationConfig) -> Thread:
+    """The merged segments through segment `origin`."""
     merged = merge_ends(ridges, config)
     ridges = replace(ridges, segments=merged.segments)
-    entries = follow(origin, merged.partner)
-    entries = _without_faint_ends(ridges, entries, origin)
-    on_thread = [e // 2 for e in entries]
+    entries = _without_faint_ends(ridges, follow(origin, merged.partner), origin)
+    doubts = tuple(
+        (ridges.segments[e // 2][-(e % 2)], why, rest) for e, why, rest in merged.doubts(entries)
+    )
     pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
+    chain = replace(_join(pieces), doubts=doubts)
+    return Thread(ridges, entries, origin, chain)
+
+
+def grow_thread(thread: Thread, seed: Float64, config: InitializationConfig) -> ViewGrowth:
+    """Grows by eq. (3) from the seed (2,) over the ridges of the thread."""
+    ridges, pieces = thread.ridges, thread.pieces
+    on_thread = [e // 2 for e in thread.entries]
     merges = np.array([(a[-1], b[0]) for a, b in pairwise(pieces)])
-    cost = _grow(ridges, pieces, on_thread.index(origin), seed, config)
+    cost = _grow(ridges, pieces, on_thread.index(thread.origin), seed, config)
     reached = [k for k, s in enumerate(ridges.segments) if _is_reached(s, cost)]
     rejected = tuple(
         (ridges.segments[k], "branches off without a matching end")
@@ -64,11 +89,7 @@ def grow_thread(
         if k not in on_thread
     )
     segments = tuple(ridges.segments[k] for k in reached)
-    view = ViewGrowth(cost, segments, merges.reshape(-1, 2, 2), rejected)
-    doubts = tuple(
-        (ridges.segments[e // 2][-(e % 2)], why, rest) for e, why, rest in merged.doubts(entries)
-    )
-    return replace(_join(pieces), doubts=doubts), view
+    return ViewGrowth(cost, segments, merges.reshape(-1, 2, 2), rejected)
 
 
 def _without_faint_ends(ridges: Ridges, entries: list[int], origin: int) -> list[int]:

@@ -9,7 +9,7 @@ import numpy as np
 from suturetrack.initialization.growth import Chain
 from suturetrack.kernels import matching as kernel
 from suturetrack.kernels import search
-from suturetrack.types import Float32, Float64
+from suturetrack.types import Bool, Float32, Float64
 
 _STATE_PX = 1.0
 _LARGEST_CHANGE = 1
@@ -29,6 +29,8 @@ class Match:
     """(k, 2) pixels."""
     response: Float64
     """(k,) how much the other view looks like thread there: 1 as much as the chain's own."""
+    inside: Bool
+    """(k,) whether the other image reaches there."""
 
 
 def match(chain: Chain, own: Float32, other: Float32, nearest: float, side: int) -> Match:
@@ -53,7 +55,7 @@ def match(chain: Chain, own: Float32, other: Float32, nearest: float, side: int)
     pixels = chain.pixels - np.c_[disparity, np.zeros(len(disparity))]
     inside = (pixels[:, 0] >= 0) & (pixels[:, 0] <= other.shape[1] - 1)
     response = 1.0 - costs[np.arange(len(states)), states].astype(float)
-    return Match(pixels, np.where(inside, response, 0.0))
+    return Match(pixels, np.where(inside, response, 0.0), inside)
 
 
 def chain_tangents(pixels: Float64, reach: int = 3) -> Float64:

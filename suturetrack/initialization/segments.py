@@ -32,6 +32,10 @@ _KINK = 0.6
 """Cosine of the turn, over `_KINK_REACH` points to both sides, from which a segment has a kink."""
 _NOISE_QUANTILE = 0.9
 _ABOVE_NOISE = 2.0
+_MOST_CREST = 1 / 16
+"""Share of the pixels on crests from which a field shows noise and nothing else: a dark image."""
+_MOST_AT_ONCE = 32766
+"""Places that OpenCV looks up in one call."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +53,14 @@ class Ridges:
 
     def sample(self, pixels: Float64) -> Float64:
         """(k,) ||V|| at (k, 2) pixels, bilinear, 0 outside."""
-        maps = np.asarray(pixels, np.float32).reshape(-1, 1, 2)
-        return cv2.remap(self.magnitude, maps, None, cv2.INTER_LINEAR).ravel().astype(float)
+        return _bilinear(self.magnitude, pixels)
 
 
 def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
-    """Crest lines of an (H, W, 2) field, split at junctions; weak and tiny ones are left out."""
+    """Crest lines of an (H, W, 2) field, split at junctions; weak and tiny ones are left out.
+
+    A field of noise has none: thousands of them would keep whoever asks busy for minutes.
+    """
     # cv2.magnitude would make the last bits depend on where the arrays lie in memory.
     magnitude = np.sqrt(field[..., 0] ** 2 + field[..., 1] ** 2)
     background = float(np.quantile(magnitude[::4, ::4], _NOISE_QUANTILE))
@@ -62,7 +68,7 @@ def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
     mask = crest.crest_pixels(field, magnitude, low)
     crest.thin(mask, magnitude)
     pixels, starts = crest.trace_chains(mask)
-    if len(pixels) == 0:
+    if not 0 < len(pixels) < _MOST_CREST * mask.size:
         return Ridges(field, magnitude, (), low)
     refined = _sub_pixel(field, magnitude, pixels)
     strength = magnitude[pixels[:, 1], pixels[:, 0]]
@@ -153,12 +159,17 @@ def _sub_pixel(field: Float32, magnitude: Float32, pixels: Float64) -> Float64:
     v = field[pixels[:, 1], pixels[:, 0]]
     centre = magnitude[pixels[:, 1], pixels[:, 0]].astype(float)
     normals = np.c_[-v[:, 1], v[:, 0]] / centre[:, None]
-    before, after = (
-        cv2.remap(
-            magnitude, (pixels + side * normals).astype(np.float32)[:, None], None, cv2.INTER_LINEAR
-        ).ravel()
-        for side in (-1, 1)
-    )
+    before, after = (_bilinear(magnitude, pixels + side * normals) for side in (-1, 1))
     bend = before + after - 2 * centre
     shift = np.where(bend < 0, (before - after) / np.where(bend < 0, 2 * bend, 1), 0)
     return pixels + np.clip(shift, -1, 1)[:, None] * normals
+
+
+def _bilinear(magnitude: Float32, pixels: Float64) -> Float64:
+    """(k,) values at (k, 2) pixels, 0 outside."""
+    maps = np.asarray(pixels, np.float32).reshape(-1, 1, 2)
+    pieces = [
+        cv2.remap(magnitude, maps[i : i + _MOST_AT_ONCE], None, cv2.INTER_LINEAR)
+        for i in range(0, max(len(maps), 1), _MOST_AT_ONCE)
+    ]
+    return np.concatenate(pieces).ravel().astype(float)

@@ -1,0 +1,104 @@
+"""Which view shows the thread better: each proposes its own, and the other is searched for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from suturetrack.initialization.confidence import clarity
+from suturetrack.initialization.growth import Chain, Thread, follow_thread, nearest_segment
+from suturetrack.initialization.matching import Match, match
+from suturetrack.initialization.model import InitializationConfig
+from suturetrack.initialization.segments import Ridges
+from suturetrack.metrics import coverage
+from suturetrack.types import Float64, RidgeField
+
+AGREED = 0.95
+"""Share of a thread on which two views must agree."""
+_NEAR_PX = 3.0
+_UNMATCHED = 0.35
+"""Response, against that of a thread, below which the other view does not show it."""
+_UNMATCHED_PRICE = 12.0
+"""What the share that the other view does not show takes from the worth of a hypothesis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A thread in both views."""
+
+    left: Thread
+    right: Thread | None
+    """None where the right view shows no ridge."""
+    matched: Match
+    """The right pixels of `pixels`' left ones, or the left ones where `by_right`."""
+    by_right: bool = False
+    """Whether the chain is the right view's, matched in the left one."""
+
+    @property
+    def pixels(self) -> Float64:
+        """(k, 4) left and right pixels, about 1 px apart in the view that shows the thread better; of a
+        right chain only what the left view shows, too."""
+        if self.by_right and self.right is not None:
+            inside = np.flatnonzero(self.matched.inside)
+            both = slice(inside[0], inside[-1] + 1)
+            return np.c_[self.matched.pixels[both], self.right.chain.pixels[both]]
+        return np.c_[self.left.chain.pixels, self.matched.pixels]
+
+    @property
+    def chains(self) -> tuple[Chain, Chain]:
+        """The thread as each view by itself has it."""
+        nothing = Chain(np.empty((0, 2)), np.empty(0, bool))
+        return self.left.chain, nothing if self.right is None else self.right.chain
+
+
+def find_thread(
+    field: RidgeField,
+    ridges: tuple[Ridges, Ridges],
+    origin: int,
+    seed: Float64,
+    nearest: float,
+    config: InitializationConfig,
+) -> Hypothesis:
+    """The thread through segment `origin` of the left view as the view shows it that shows it better.
+
+    Args:
+        field: both views.
+        ridges: of the left and the right view.
+        origin: segment of the left view.
+        seed: (2,) left pixel on it.
+        nearest: disparity of points at infinity, px.
+        config: settings.
+    """
+    left = follow_thread(ridges[0], origin, config)
+    matched = match(left.chain, field.left, field.right, nearest, 1)
+    there = matched.pixels[_closest(left.chain.pixels, seed)]
+    partner, _ = nearest_segment(ridges[1], there, np.inf)
+    if partner is None:
+        return Hypothesis(left, None, matched)
+    right = follow_thread(ridges[1], partner, config)
+    first = Hypothesis(left, right, matched)
+    if _agreement(matched.pixels[matched.inside], right.chain.pixels) >= AGREED:
+        return first
+    mirrored = match(right.chain, field.right, field.left, -nearest, -1)
+    through_seed = np.linalg.norm(mirrored.pixels - seed, axis=1).min() <= config.snap_px
+    if through_seed and _worth(right, mirrored) > _worth(left, matched):
+        return Hypothesis(left, right, mirrored, by_right=True)
+    return first
+
+
+def _agreement(one: Float64, other: Float64) -> float:
+    """The lesser share of two chains, (k, 2) and (m, 2), that runs along the other."""
+    if len(one) < 2 or len(other) < 2:
+        return 0.0
+    return min(coverage(one, other, _NEAR_PX), coverage(other, one, _NEAR_PX))
+
+
+def _worth(thread: Thread, matched: Match) -> float:
+    unmatched = float(((matched.response < _UNMATCHED) & matched.inside).mean())
+    worth = np.count_nonzero(matched.inside) * clarity(thread.chain)
+    return float(worth * np.exp(-_UNMATCHED_PRICE * unmatched))
+
+
+def _closest(pixels: Float64, place: Float64) -> int:
+    return int(np.argmin(np.linalg.norm(pixels - place, axis=1)))
