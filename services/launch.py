@@ -96,6 +96,7 @@ def run(config: RunConfig | DemoConfig) -> None:
         rig_name = stack.enter_context(_reserved(config.service))
         config, rig = _resolve(config, rig_name)
         _make_run_folder(config, rig)
+        console.print(_rig_line(rig))
         console.print(f"Recording to {config.service.run_dir}")
         if not config.seed:
             console.print("No --seed U V: nothing is tracked until a seed is sent.")
@@ -103,6 +104,13 @@ def run(config: RunConfig | DemoConfig) -> None:
     for table in monitor.tables():
         console.print(table)
     console.print(f"Open it with: suturetrack view {config.service.run_dir}")
+
+
+def _rig_line(rig: StereoRig) -> str:
+    unit = "m" if rig.metres_per_unit == 1 else "mm"
+    width, height = rig.image_size
+    baseline_mm = rig.baseline * rig.metres_per_unit * 1000
+    return f"Rig: {width}x{height} px, baseline {baseline_mm:.2f} mm, calibrated in {unit}"
 
 
 def _resolve(config: RunConfig, rig_name: str) -> tuple[RunConfig, StereoRig]:
