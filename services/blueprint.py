@@ -100,12 +100,13 @@ def _initialization() -> rrb.Container:
 
 
 def _segmentation() -> rrb.Container:
-    return rrb.Grid(
+    views = rrb.Grid(
         *(_view(view, "") for view in VIEWS),
         *(_view(view, "/direction", name=f"{view}, hue is direction") for view in VIEWS),
         grid_columns=2,
-        name="Segmentation",
     )
+    key = rrb.Spatial2DView(origin="/key/direction", name="Key to the directions")
+    return rrb.Horizontal(views, key, column_shares=[6, 1], name="Segmentation")
 
 
 def _parameters() -> rrb.Container:

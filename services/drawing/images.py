@@ -23,14 +23,15 @@ from services.drawing.common import (
 )
 from services.drawing.growth import style as growth_style
 from suturetrack.camera import Camera, StereoRig
-from suturetrack.segmentation import direction_image
+from suturetrack.segmentation import direction_image, direction_key
 from suturetrack.types import Float64, RidgeField, StereoFrame
 
+_KEY_PX = 129
 _PROCESS_COLORS = {"source": BLUE, "segmenter": VIOLET, "tracker": ORANGE}
 
 
 def cameras(rig: StereoRig) -> Iterator[Entry]:
-    """The cameras; all of it static."""
+    """The cameras, and the key to the directions; all of it static."""
     yield "/rig", rr.ViewCoordinates.RDF
     poses = (np.zeros(3), np.array([rig.baseline, 0.0, 0.0]))
     for view, camera, position in zip(VIEWS, (rig.left, rig.right), poses, strict=True):
@@ -43,6 +44,7 @@ def cameras(rig: StereoRig) -> Iterator[Entry]:
         )
         yield f"/rig/{view}/image", pinhole
     yield from growth_style()
+    yield "/key/direction", rr.Image(direction_key(_KEY_PX), color_model="BGR")
     yield "/run/calibration", values("Calibration", _calibration(rig))
 
 
