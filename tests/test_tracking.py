@@ -201,6 +201,21 @@ def test_two_threads_keep_their_names(rig: StereoRig) -> None:
     assert [s.thread for s in tracker.step(paint(rig, pair, 21)).states] == [kept.thread] == ["b"]
 
 
+def test_a_thread_that_is_seeded_again_keeps_its_direction(rig: StereoRig) -> None:
+    points = thread(0.0)
+    tracker, states = Tracker(rig), []
+    for frame, at in enumerate((100, 500, 300)):
+        tracker.seed(seed_on(rig, points[at : at + 1]))
+        states += tracker.step(paint(rig, [points], frame)).states
+    turned = replace(states[0], curve=nurbs.reversed_curve(states[0].curve))
+    tracker.resume(seed_on(rig, points), turned)
+    tracker.seed(seed_on(rig, points))
+    states += tracker.step(paint(rig, [points], 3)).states
+    starts = [s.curve.control_points[0] for s in states if s.curve is not None]
+    np.testing.assert_allclose(starts[1:3], [starts[0]] * 2, atol=2.0)
+    assert np.linalg.norm(starts[3] - turned.curve.control_points[0]) < 2.0
+
+
 def test_fields_that_repeat_or_come_late_change_nothing(rig: StereoRig) -> None:
     truths = [thread(i / FPS) for i in range(12)]
     fields = [paint(rig, [points], i) for i, points in enumerate(truths)]

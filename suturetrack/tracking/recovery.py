@@ -34,7 +34,7 @@ def find_again(
         except InitializationError:
             continue
         if abs(length(curve) / known_length - 1) < _LENGTH_TOLERANCE:
-            return _directed(curve, last)
+            return directed(curve, last)
     return None
 
 
@@ -59,7 +59,9 @@ def _seeds_on(last: Nurbs, thread: str, field: RidgeField, rig: StereoRig) -> li
     ]
 
 
-def _directed(curve: Nurbs, last: Nurbs) -> Nurbs:
+def directed(curve: Nurbs, last: Nurbs) -> Nurbs:
+    """The curve in the direction of the last one."""
+
     def apart(a: Nurbs) -> float:
         s: Float64 = np.linspace(0, 1, 16)
         return float(np.linalg.norm(evaluate(a, s) - evaluate(last, s), axis=1).sum())

@@ -13,9 +13,10 @@ from suturetrack.initialization import (
     InitializationError,
     initialize,
 )
+from suturetrack.tracking.clock import StreamClock
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
-from suturetrack.tracking.recovery import find_again
+from suturetrack.tracking.recovery import directed, find_again
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.types import Energies, Nurbs, RidgeField, Seed, Stamp, Status, ThreadState
 
@@ -41,6 +42,8 @@ class _Thread:
     attempts: int
     follower: Follower | None = None
     last: ThreadState | None = None
+    toward: Nurbs | None = None
+    """Curve of the thread that had the name before."""
     wait_ns: int = 0
     """Until when the lost thread is not looked for again."""
 
@@ -57,13 +60,17 @@ class Tracker:
         self._rig, self._config, self._initialization = rig, config, initialization
         self._threads: dict[str, _Thread] = {}
         self._forgotten: list[str] = []
+        self._clock = StreamClock()
 
     def seed(self, seed: Seed) -> None:
         """Looks for the thread from the next field on, for up to `config.patience` fields.
 
-        A thread of the same name is looked for anew.
+        A thread of the same name is looked for anew, and keeps its direction.
         """
-        self._threads[seed.thread] = _Thread(seed, self._config.patience)
+        before, thread = self._threads.get(seed.thread), _Thread(seed, self._config.patience)
+        if before is not None:
+            thread.toward = (before.last and before.last.curve) or before.toward
+        self._threads[seed.thread] = thread
 
     def resume(self, seed: Seed, last: ThreadState) -> None:
         """Takes a thread up where another tracker left it, lost until it is found again.
@@ -91,28 +98,29 @@ class Tracker:
         """The seeded threads in the next field.
 
         A field that is not newer than the last one changes nothing: its states are the last ones.
+        Dates may jump; time then goes on from where it was.
         """
+        is_new = self._clock.advance(field.stamp)
+        dated = replace(field, stamp=replace(field.stamp, capture_ns=self._clock.now_ns))
         initializations: dict[str, Initialization | InitializationError] = {}
         states = [_not_found(name, field.stamp, (FORGOTTEN,)) for name in self._forgotten]
         self._forgotten.clear()
         for name, thread in self._threads.items():
-            if thread.follower is not None:
-                state = self._follow(name, thread, thread.follower, field)
+            if thread.follower is not None and thread.last is not None and not is_new:
+                state = replace(thread.last, events=("not newer than the last field",))
+            elif thread.follower is not None:
+                state = self._follow(name, thread, thread.follower, dated)
             elif thread.last is not None and thread.last.curve is not None:
-                state = self._regain(name, thread, thread.last.curve, thread.last, field)
+                state = self._regain(name, thread, thread.last.curve, thread.last, dated)
             else:
-                state = self._find(name, thread, field, initializations)
-            thread.last = state
-            states.append(state)
+                state = self._find(name, thread, dated, initializations)
+            thread.last = replace(state, stamp=field.stamp)
+            states.append(thread.last)
         return TrackerStep(tuple(states), initializations)
 
     def _follow(
         self, name: str, thread: _Thread, follower: Follower, field: RidgeField
     ) -> ThreadState:
-        if thread.last is not None and field.stamp.capture_ns <= thread.last.stamp.capture_ns:
-            return replace(
-                thread.last, stamp=field.stamp, events=("not newer than the last field",)
-            )
         state = follower.step(field, name)
         was_lost = thread.last is not None and thread.last.status is Status.LOST
         if state.status is not Status.LOST:
@@ -158,6 +166,8 @@ class Tracker:
         except InitializationError as error:
             initializations[name] = error
             return _not_found(name, field.stamp, (f"not found: {error.reason}",))
+        if thread.toward is not None:
+            found = replace(found, curve=directed(found.curve, thread.toward))
         initializations[name] = found
         thread.follower = Follower(found.curve, field, self._rig, self._config)
         state = thread.follower.step(field, name)
