@@ -67,6 +67,9 @@ def run(service: Service, config: SourceConfig) -> None:
         frame = StereoFrame(stamp, exposure.left, exposure.right)
         if combs.sees(exposure.left):
             service.complain("the video seems interlaced: de-interlace it, thin threads comb")
+        if exposure.skipped:
+            service.meter.skipped += exposure.skipped
+            service.complain(f"{exposure.skipped} images left out: no partner within --slop-ms")
         truths = [dataclasses.replace(truth, stamp=stamp) for truth in exposure.truths]
         for truth in truths:
             bus.publish(topics.TRUTH, scaled(truth, rig.metres_per_unit))

@@ -167,6 +167,7 @@ def test_images_without_a_partner_are_left_out(tmp_path: Path, ros2: Ros) -> Non
     seen = [footage.read(i) for i in range(4)]
     assert [told(e.left)[0] for e in seen if e is not None] == [0, 3, 4]
     assert [told(e.right)[0] for e in seen if e is not None] == [0, 3, 4]
+    assert [e.skipped for e in seen if e is not None] == [0, 2, 0]
     footage.close()
 
 
@@ -381,8 +382,8 @@ def test_each_image_gets_the_partner_nearest_in_time() -> None:
         (True, 450),
     ]:
         pairs.append(pairing.add(right, stamp, stamp))
-    assert [p for p in pairs if p] == [(200, 200, 205), (300, 300, 309)]
-    assert pairing.unpaired == 1
+    found = [(p.stamp_ns, p.left, p.right, p.skipped) for p in pairs if p]
+    assert found == [(200, 200, 205, 1), (300, 300, 309, 0)]
     assert pairing.closest_ns == 5
 
 

@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from services.sources.footage import Exposure
 from services.sources.pairing import (
+    Pair,
     Pairing,
     camera_info_topic,
     is_rectified_topic,
@@ -74,7 +75,7 @@ class BagFootage:
                 self.topics = stereo_topics(set(images), topics)
             except InputError as error:
                 raise InputError(f"{self._where}: {error}") from error
-            stamps = [stamp for stamp, _, _ in itertools.islice(self._pairs(), _LOOKED_AT)]
+            stamps = [p.stamp_ns for p in itertools.islice(self._pairs(), _LOOKED_AT)]
             self.fps = _rate(stamps, fps)
             self.frame_count: int | None = None
             self.rectified = is_rectified_topic(self.topics[0])
@@ -115,14 +116,14 @@ class BagFootage:
         """See `Footage`."""
         self._reader.close()
 
-    def _decode(self, pair: tuple[int, _Raw, _Raw]) -> Exposure:
-        stamp, *sides = pair
+    def _decode(self, pair: Pair[_Raw]) -> Exposure:
+        sides = pair.left, pair.right
         left, right = (decode(self._open(raw), raw.connection.topic) for raw in sides)
         if left.shape != right.shape:
             raise InputError(f"{self._where}: left is {left.shape}, right is {right.shape}")
-        return Exposure(stamp, left, right)
+        return Exposure(pair.stamp_ns, left, right, skipped=pair.skipped)
 
-    def _pairs(self) -> Iterator[tuple[int, _Raw, _Raw]]:
+    def _pairs(self) -> Iterator[Pair[_Raw]]:
         pairing: Pairing[_Raw] = Pairing(self._slop_ns)
         paired = False
         wanted = [c for c in self._reader.connections if c.topic in self.topics]

@@ -24,6 +24,8 @@ class Exposure:
     """As `left`."""
     truths: tuple[Truth, ...] = ()
     """Where the threads really are, when that is known."""
+    skipped: int = 0
+    """Images without a partner that were left out since the exposure before."""
 
 
 class Stalled(Exception):

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from suturetrack.types import Image
 
-_TEETH = 12.0
+_TEETH = 12
 """Gray levels between neighbouring rows that make a tooth; above the noise of cameras."""
 _COMBED = 0.002
 """Share of the pixels that is combed where something moves in interlaced video."""
-_EVERY = 10
-"""Frames between two looks."""
+_EVERY, _LOOKS = 10, 60
+"""Frames from one look to the next, and how many there are."""
+_STRIDE = 4
+"""Of the columns of rows, and of the rows of columns, one in so many is looked at."""
 
 
 def combing(image: Image) -> float:
@@ -20,28 +23,28 @@ def combing(image: Image) -> float:
     Args:
         image: (H, W) or (H, W, 3).
     """
-    gray = image.astype(np.float32) if image.ndim == 2 else image.mean(axis=2, dtype=np.float32)
-    return _alternating(gray) - _alternating(gray.T)
+    gray = (image if image.ndim == 2 else image[..., 1]).astype(np.int16)
+    return _alternating(gray[:, ::_STRIDE]) - _alternating(gray.T[:, ::_STRIDE])
 
 
 class CombWatch:
-    """Looks at some frames until one is combed."""
+    """Looks at some of the first frames until one is combed."""
 
     def __init__(self) -> None:
-        self._until = 0
-        self._told = False
+        self._frames = 0
+        self._done = False
 
     def sees(self, image: Image) -> bool:
         """Whether this is the first frame seen to be combed."""
-        self._until -= 1
-        if self._told or self._until > 0:
+        looks, others = divmod(self._frames, _EVERY)
+        self._frames += 1
+        if self._done or others or looks >= _LOOKS:
             return False
-        self._until = _EVERY
-        self._told = combing(image) > _COMBED
-        return self._told
+        self._done = combing(image) > _COMBED
+        return self._done
 
 
-def _alternating(gray: np.ndarray) -> float:
+def _alternating(gray: NDArray[np.int16]) -> float:
     """Share of the pixels where three steps in a row go up and down by a tooth each."""
     steps = np.diff(gray, axis=0)
     up, down = steps > _TEETH, steps < -_TEETH

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from suturetrack.types import InputError
@@ -12,6 +13,18 @@ T = TypeVar("T")
 
 _WAITING = 32
 """Images of one side that may wait for the other side."""
+
+
+@dataclass(frozen=True)
+class Pair(Generic[T]):
+    """What belongs together."""
+
+    stamp_ns: int
+    """Of the left image."""
+    left: T
+    right: T
+    skipped: int
+    """Images given up since the pair before."""
 
 
 class Pairing(Generic[T]):
@@ -25,13 +38,12 @@ class Pairing(Generic[T]):
     def __init__(self, slop_ns: int):
         self._slop_ns = slop_ns
         self._waiting: tuple[deque[tuple[int, T]], deque[tuple[int, T]]] = (deque(), deque())
-        self.unpaired = 0
-        """Images given up so far."""
+        self._skipped = 0
         self.closest_ns: int | None = None
         """How near to one another stamps of both sides have come."""
 
-    def add(self, right: bool, stamp_ns: int, image: T) -> tuple[int, T, T] | None:
-        """Takes an image; the left one's stamp and both images when it completes a pair."""
+    def add(self, right: bool, stamp_ns: int, image: T) -> Pair[T] | None:
+        """Takes an image; gives the pair that it completes."""
         mine, others = self._waiting[right], self._waiting[not right]
         if others:
             nearest = min(range(len(others)), key=lambda i: abs(others[i][0] - stamp_ns))
@@ -42,7 +54,7 @@ class Pairing(Generic[T]):
         mine.append((stamp_ns, image))
         if len(mine) > _WAITING:
             mine.popleft()
-            self.unpaired += 1
+            self._skipped += 1
         return None
 
     def advice(self) -> str:
@@ -55,14 +67,16 @@ class Pairing(Generic[T]):
             f"{slop:g}; trigger the cameras together, or allow more"
         )
 
-    def _complete(self, right: bool, stamp_ns: int, image: T, nearest: int) -> tuple[int, T, T]:
+    def _complete(self, right: bool, stamp_ns: int, image: T, nearest: int) -> Pair[T]:
         mine, others = self._waiting[right], self._waiting[not right]
-        self.unpaired += len(mine) + nearest
+        skipped, self._skipped = self._skipped + len(mine) + nearest, 0
         mine.clear()
         for _ in range(nearest):
             others.popleft()
         other_ns, other = others.popleft()
-        return (other_ns, other, image) if right else (stamp_ns, image, other)
+        if right:
+            return Pair(other_ns, other, image, skipped)
+        return Pair(stamp_ns, image, other, skipped)
 
 
 def stereo_topics(topics: Iterable[str], given: tuple[str, str] | None) -> tuple[str, str]:

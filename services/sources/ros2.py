@@ -109,7 +109,7 @@ class Ros2Footage:
                 pair = self._pairing.add(right, stamp_ns(message), message)
             if pair is None:
                 return
-            stamp, *sides = pair
+            sides = pair.left, pair.right
             try:
                 left, other = (decode(m, t) for m, t in zip(sides, self.topics, strict=True))
                 if left.shape != other.shape:
@@ -117,7 +117,7 @@ class Ros2Footage:
             except InputError as error:
                 self._newest.fail(error)
             else:
-                self._newest.put(Exposure(stamp, left, other))
+                self._newest.put(Exposure(pair.stamp_ns, left, other, skipped=pair.skipped))
 
         return take
 
