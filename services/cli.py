@@ -54,6 +54,7 @@ VERBS = {
     "doctor": _Verb("services.doctor", "DoctorConfig", "what is wrong, and what to do"),
     "router": _Verb("services.router", "RouterConfig", "pass messages between hosts"),
     "keys": _Verb("services.keys", "KeysConfig", "certificates and access rules for several hosts"),
+    "record": _Verb("services.record", "RecordConfig", "record what runs, until stopped", True),
     "console": _Verb("services.console", "ConsoleConfig", "the operator's page: watch and seed"),
     "tooltip": _Verb(
         "services.tooltip", "TooltipConfig", "the process that lets the tip of a tool seed", True

@@ -1,40 +1,53 @@
-"""What a running system sees and decides, in the Rerun viewer while it goes on.
+"""What a running system sees and decides, to the Rerun viewer or to a recording while it goes on.
 
 A process of its own that only listens: a slow viewer costs the pictures that it misses, never the loop.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import groupby
+from typing import Self
 
 import rerun as rr
 
 from services import topics
 from services.bus import Bus
+from services.recording import Recorder
 from services.wire import scaled
 from services.writer import Writer
 from suturetrack.camera import StereoRig
 
+PUBLISHERS = tuple(topic.publisher for topic in (topics.FRAME, topics.FIELD, topics.STATE))
 _WAIT_S = 0.02
 
 
 class LiveView:
-    """Writes what is published on a rig to a stream."""
+    """Writes what is published on a rig, in the name of those who publish it.
 
-    def __init__(self, bus: Bus, rig: StereoRig, stream: rr.RecordingStream) -> None:
+    Args:
+        bus: of a process that only listens.
+        rig: the calibrated cameras.
+        writers: what the source, the segmenter and the tracker publish goes to these three.
+    """
+
+    def __init__(self, bus: Bus, rig: StereoRig, writers: Sequence[Writer | Recorder]) -> None:
         self._rig = rig
+        self._source, self._segmenter, self._tracker = writers
         self._frames = bus.newest(topics.FRAME)
         self._fields = bus.newest(topics.FIELD)
         self._states = bus.every(topics.STATE)
         self._truths = bus.every(topics.TRUTH)
         self._healths = bus.every(topics.HEALTH)
-        processes = (topics.FRAME.publisher, topics.FIELD.publisher, topics.STATE.publisher)
-        self._source, self._segmenter, self._tracker = (
-            Writer(stream, process, "light", rig) for process in processes
-        )
-        for writer in (self._source, self._segmenter, self._tracker):
+
+    @classmethod
+    def on(cls, bus: Bus, rig: StereoRig, stream: rr.RecordingStream) -> Self:
+        """Writes to one stream."""
+        writers = [Writer(stream, process, "light", rig) for process in PUBLISHERS]
+        for writer in writers:
             writer.describe()
-        stream.send_blueprint(self._tracker.layout())
+        stream.send_blueprint(writers[-1].layout())
+        return cls(bus, rig, writers)
 
     def step(self) -> None:
         """Shows what has arrived, after waiting a little for a frame."""

@@ -49,7 +49,7 @@ def test_what_is_published_is_shown(tmp_path: Path, rig: StereoRig, curve: Nurbs
     publish_frame(speaker, 0, curve, rig)  # too early for the view
     stream = rr.RecordingStream("suturetrack", recording_id="live")
     stream.set_sinks(rr.FileSink(str(tmp_path / "live.rrd")))
-    live = LiveView(listener, rig, stream)
+    live = LiveView.on(listener, rig, stream)
     for i in (1, 2):
         publish_frame(speaker, i, curve, rig)
         live.step()

@@ -1,0 +1,49 @@
+"""The process that records a running system from outside: started and stopped as one likes."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from services.live import PUBLISHERS, LiveView
+from services.recording import Recorder
+from services.service import Service, ServiceConfig
+from suturetrack.calibration import save_calibration
+from suturetrack.types import InputError
+
+
+@dataclass(frozen=True)
+class RecordConfig:
+    """Records what the processes of a rig publish, until Ctrl-C, into a new folder of recordings/."""
+
+    service: Annotated[ServiceConfig, tyro.conf.arg(name="")] = field(default_factory=ServiceConfig)
+
+
+def run(service: Service, config: RecordConfig) -> None:
+    """Records until stopped; raises InputError when the folder cannot be used."""
+    folder = config.service.run_dir or fresh_folder()
+    if folder.is_dir() and any(folder.glob("*.rrd")):
+        raise InputError(f"run folder {folder} holds a run already; give another --run-dir")
+    rig = service.calibrated_rig()
+    with ExitStack() as stack:
+        level = config.service.recording
+        recorders = [
+            stack.enter_context(Recorder(folder, name, level, rig, config, patient=False))
+            for name in PUBLISHERS
+        ]
+        save_calibration(folder / "calibration.yaml", rig)
+        view = LiveView(service.bus, rig, recorders)
+        service.bus.declare_alive()
+        while not service.bus.stop.is_set:
+            view.step()
+    print(f"Open it with: suturetrack view {folder}")
+
+
+def fresh_folder() -> Path:
+    """A folder named after now."""
+    return Path("recordings") / f"{time.strftime('%Y%m%d-%H%M%S')}-live"

@@ -1,0 +1,57 @@
+"""A running system is recorded from outside, for as long as one likes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from services import record, topics
+from services.bus import Bus
+from services.memory_transport import Hub
+from services.record import RecordConfig
+from services.run_folder import RunFolder
+from services.service import Service, ServiceConfig
+from suturetrack.calibration import load_calibration
+from suturetrack.camera import StereoRig
+from suturetrack.types import InputError, Nurbs
+from tests.test_live import publish_frame
+
+
+def test_what_is_published_meanwhile_is_recorded(
+    tmp_path: Path, rig: StereoRig, curve: Nurbs
+) -> None:
+    hub, folder = Hub(), tmp_path / "run"
+    speaker = Bus(hub.connect(), "rig", "tracker")
+    speaker.answer(topics.CALIBRATION, lambda _: rig)
+    config = RecordConfig(ServiceConfig(run_dir=folder))
+    service = Service("record", config.service, Bus(hub.connect(), "rig", "record"))
+    recording = threading.Thread(target=record.run, args=(service, config), daemon=True)
+    recording.start()
+    assert speaker.wait_for_alive("record", 30)
+    for i in range(3):
+        publish_frame(speaker, i, curve, rig)
+        time.sleep(0.05)
+    service.bus.stop.set()
+    recording.join(30)
+    assert not recording.is_alive()
+    service.bus.close()
+    speaker.close()
+
+    found = RunFolder(folder)
+    assert not found.problems
+    frames = [(s.state.stamp.frame, s.state.thread) for s in found.states()]
+    assert {"a", "b"} == {thread for _, thread in frames}
+    assert found.images({frame for frame, _ in frames})
+    assert load_calibration(folder / "calibration.yaml").image_size == rig.image_size
+
+
+def test_a_folder_that_holds_a_run_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "source.rrd").touch()
+    config = RecordConfig(ServiceConfig(run_dir=tmp_path))
+    service = Service("record", config.service, Bus(Hub().connect(), "rig", "record"))
+    with pytest.raises(InputError, match="holds a run already"):
+        record.run(service, config)
+    service.bus.close()
