@@ -33,6 +33,7 @@ _SEARCH_STEP_PX = 1.0
 _CHORD = 6
 # What active search finds has to respond so much more than the place where the point is.
 _CLEARER = 0.1
+_INWARD = 5.0
 _DAMPING = 1e-3
 
 
@@ -118,11 +119,14 @@ def _end_offsets(image: Float32, view: View, cutoff: float, config: PaperConfig)
 
 
 def _search_end(image: Float32, view: View, end: int, cutoff: float, reach_px: float) -> float:
-    """px outward from the end 0 or -1 to where the response falls to the cut-off; 0 where nothing is seen."""
-    x = np.arange(-reach_px, reach_px + _SEARCH_STEP_PX / 2, _SEARCH_STEP_PX)
+    """px outward from the end 0 or -1 to where the response falls to the cut-off.
+
+    Inward the curve tells where to look, so the search goes further there. 0 where nothing is seen.
+    """
+    x = np.arange(-_INWARD * reach_px, reach_px + _SEARCH_STEP_PX / 2, _SEARCH_STEP_PX)
     shown = search.responses(image, *_along_end(view, end, x))
     above = shown > cutoff
-    if above.all():
+    if above[x >= 0].all():
         return reach_px
     falls = np.flatnonzero(above[:-1] & ~above[1:])
     if not len(falls):
