@@ -127,11 +127,12 @@ def _open_footage(config: InputConfig) -> Footage:
         return Ros2Footage(names, config.ros, slop_ns, wants_rig=config.calibration is None)
     if is_bag(Path(config.source)):
         return BagFootage(Path(config.source), config.topics, slop_ns, config.fps)
+    size = _given_rig(config).image_size
     parts = config.source.split(",")
     if len(parts) > 2:
         raise InputError(f"source {config.source}: at most two files or devices, LEFT,RIGHT")
     if all(is_device(part) for part in parts):
-        return CameraFootage(parts, _given_rig(config).image_size, config.fps)
+        return CameraFootage(parts, size, config.fps)
     if len(parts) == 1 and Path(parts[0]).is_dir():
         return FolderFootage(Path(parts[0]), config.fps)
     return VideoFootage([Path(part) for part in parts])
