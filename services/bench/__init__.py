@@ -9,10 +9,11 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from services.bench import faults, initialization, latency, report, segmentation, tracking
+from services.bench import faults, initialization, latency, load, report, segmentation, tracking
 from services.bench.faults import FaultsBench
 from services.bench.initialization import InitializationBench
 from services.bench.latency import LatencyBench
+from services.bench.load import LoadBench
 from services.bench.report import Plot
 from services.bench.segmentation import SegmentationBench
 from services.bench.tracking import TrackingBench
@@ -33,6 +34,7 @@ _PLOTS = {
     ),
     "segmentation": (Plot("pair_ms", "filter", logarithmic=True), Plot("f1", "filter")),
     "latency": (Plot("p50_ms", "process"), Plot("p99_ms", "process")),
+    "load": (Plot("rate_hz", "load", reference="asked_hz"), Plot("latency_p99_ms", "load")),
     "faults": (
         Plot("stale_max_ms", "fault", reference="limit_ms"),
         Plot("back_max_s", "fault", logarithmic=True),
@@ -50,7 +52,8 @@ class BenchConfig:
         | Annotated[InitializationBench, tyro.conf.subcommand("initialization")]
         | Annotated[SegmentationBench, tyro.conf.subcommand("segmentation")]
         | Annotated[LatencyBench, tyro.conf.subcommand("latency")]
-        | Annotated[FaultsBench, tyro.conf.subcommand("faults")],
+        | Annotated[FaultsBench, tyro.conf.subcommand("faults")]
+        | Annotated[LoadBench, tyro.conf.subcommand("load")],
         tyro.conf.arg(name=""),
     ]
     """The benchmark."""
@@ -73,6 +76,8 @@ def run(config: BenchConfig) -> None:
             name, table = "segmentation", [*segmentation.run(config.what, console)]
         case LatencyBench():
             name, table = "latency", [*latency.run(config.what, console)]
+        case LoadBench():
+            name, table = "load", [*load.run(config.what, console)]
         case FaultsBench():
             name, table = "faults", [*faults.run(config.what, console)]
     if config.json is not None:
