@@ -20,6 +20,7 @@ from aiohttp.test_utils import TestClient, TestServer
 from services import topics
 from services.bus import Bus
 from services.console.feed import Feed
+from services.console.recording import Recording
 from services.console.server import Console
 from services.memory_transport import Hub
 from services.messages import Forgotten, SeedReply
@@ -55,7 +56,7 @@ class Stage:
         self.system.answer(topics.CALIBRATION, lambda _: rig)
         self.system.answer(topics.SEED, self.find)
         self.system.answer(topics.FORGET, lambda f: Forgotten(f.thread, True))
-        self.feed = Feed(feed)
+        self.feed = Feed(feed, Recording("rig", None))
         self.seeds: list[Seed] = []
         self.silent = threading.Event()
         self.ridges: RidgeField | None = None
@@ -273,6 +274,8 @@ def test_a_click_seeds_and_one_on_nothing_is_told(stage: Stage) -> None:
             assert np.linalg.norm(np.array(boxed["pixel"]) - left) < 30
             empty = await page.answer("snap-box", view="left", corners=[[0, 0], [20, 20]])
             assert empty["pixel"] is None
+            none = await page.answer("record", on=False)
+            assert (none["answer"], none["text"]) == ("error", "nothing is recorded")
             gone = await page.answer("forget", thread="0")
             assert gone["accepted"]
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.run_folder import RunFolder
 from suturetrack.stage import open_scene
 from tests.browser import EXECUTABLE, Browser, Tab
 
@@ -36,6 +37,7 @@ GREEN = """(() => {
 @dataclass
 class System:
     url: str
+    directory: Path
     processes: dict[str, subprocess.Popen[str]]
 
 
@@ -53,6 +55,7 @@ def system() -> Iterator[System]:
     processes = {
         name: subprocess.Popen(
             [sys.executable, "-m", "services.cli", name, *options],
+            cwd=directory,
             env=environment,
             stdout=subprocess.PIPE,
             text=True,
@@ -61,7 +64,7 @@ def system() -> Iterator[System]:
     }
     output = processes["console"].stdout
     assert output is not None
-    yield System(output.readline().strip(), processes)
+    yield System(output.readline().strip(), Path(directory), processes)
     for process in processes.values():
         process.kill()
         process.communicate()
@@ -145,10 +148,12 @@ def test_a_click_seeds_and_the_curve_appears_on_every_page(system: System, tmp_p
     in_browser(flow())
 
 
-def test_the_right_image_a_box_and_the_keyboard_seed_too(system: System) -> None:
+def test_the_right_image_a_box_and_the_keyboard_seed_too_and_what_follows_is_recorded(
+    system: System,
+) -> None:
     async def flow() -> None:
         async with Browser() as browser:
-            tab = await page(browser, system)
+            tab, other = await page(browser, system), await page(browser, system)
             await tab.click(*await on_screen(tab, "right", *places()["right"]))
             await tab.until(TRACKED)
             await tab.key("r")
@@ -169,6 +174,19 @@ def test_the_right_image_a_box_and_the_keyboard_seed_too(system: System) -> None
             await tab.key("ArrowDown")
             await tab.key("Enter")
             await tab.until(TRACKED)
+            await tab.key("s")
+            folder = Path(await tab.until("state.moment.recording"))
+            await tab.until("$('record').getAttribute('aria-pressed') === 'true'")
+            await other.until("$('record').textContent.startsWith('Recording')")
+            written = system.directory / folder
+            while len(list(written.glob("*.rrd"))) < 3 or not RunFolder(written).states():
+                await asyncio.sleep(0.2)
+            await other.key("s")
+            await tab.until("!state.moment.recording")
+            await other.until("$('message').textContent.startsWith('Recorded')")
+            assert not RunFolder(written).problems
+            assert RunFolder(written).states()
+
             await tab.key("n")
             assert await tab.evaluate("state.chosen") == "1"
             await tab.key("1")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from services.console.feed import Feed
+from services.console.recording import Recording
 from services.console.server import serve
 from services.service import Service, ServiceConfig
 from services.service import run as run_service
@@ -43,9 +44,13 @@ def run(config: ConsoleConfig) -> None:
     def body(service: Service) -> None:
         # Whatever else the machine has to do comes first.
         os.nice(_NICE)
-        feed = Feed(service.bus)
+        recording = Recording(config.rig, config.zenoh)
+        feed = Feed(service.bus, recording)
         service.bus.declare_alive()
-        serve(feed, config.host, config.port, token)
+        try:
+            serve(feed, config.host, config.port, token)
+        finally:
+            recording.close()
 
     run_service("console", ServiceConfig(rig=config.rig, zenoh=config.zenoh), body)
 

@@ -14,6 +14,7 @@ from services import topics
 from services.bus import Bus, NoAnswer
 from services.client import Client, Refused, Unavailable
 from services.console import picture
+from services.console.recording import Recording
 from services.messages import Health
 from suturetrack.camera import StereoRig
 from suturetrack.grasping import GraspPoint
@@ -37,8 +38,9 @@ class Feed:
     Nothing is read while nobody looks, and only the newest is: the loop never waits for a page.
     """
 
-    def __init__(self, bus: Bus):
+    def __init__(self, bus: Bus, recording: Recording):
         self.bus = bus
+        self.recording = recording
         self.client = Client(bus)
         self.grasp: tuple[str, GraspPoint] | None = None
         """Whose pose is shown, and where; the same on every page."""
@@ -91,6 +93,12 @@ class Feed:
         known = self.client.forget(thread)
         text = f"Thread {thread} is followed no more." if known else f"There is no thread {thread}."
         return {"accepted": known, "text": text}
+
+    def record(self, *, on: bool) -> dict[str, Any]:
+        """Starts or completes a recording; raises InputError."""
+        if on:
+            return {"text": f"Recording to {self.recording.start()}."}
+        return {"text": f"Recorded. Open it with: suturetrack view {self.recording.stop()}"}
 
     def _sight(self) -> tuple[StereoRig, RidgeField]:
         with self._field_lock:
@@ -153,6 +161,7 @@ class Feed:
             "waiting": False,
             "threads": [picture.thread(one, rig) for one in judged.values()],
             "grasp": mark,
+            "recording": str(self.recording.folder or ""),
             "missed": self.client.missed,
             "rate_hz": tracker.rate_hz if tracker is not None else None,
             "latency_ms": tracker.latency.p50_ms if tracker is not None else None,

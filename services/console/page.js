@@ -84,7 +84,8 @@ function take(answer) {
   } else if (answer.answer === "forget") {
     state.history.delete(answer.asked.thread);
     say(answer.text, answer.accepted ? "good" : "bad");
-  } else if (answer.answer === "error") say(answer.text, "bad");
+  } else if (answer.answer === "record") say(answer.text, "good");
+  else if (answer.answer === "error") say(answer.text, "bad");
 }
 
 let silencer = 0;
@@ -133,6 +134,10 @@ function draw() {
   $("latency").textContent = moment.latency_ms == null ? "–" : `${moment.latency_ms.toFixed(0)} ms`;
   if (moment.frame != null) $("frame").textContent = moment.frame;
   if (moment.warnings && moment.warnings.length) say(moment.warnings.join(" "), "bad");
+  const recording = Boolean(moment.recording);
+  $("record").setAttribute("aria-pressed", recording);
+  $("record").firstChild.textContent = recording ? "Recording" : "Record";
+  $("record").title = moment.recording || "";
   list();
   pose();
   paint();
@@ -447,6 +452,13 @@ function add() {
 
 function reset() { if (!$("reset").disabled) send("forget", { thread: state.chosen }); }
 
+function record() {
+  const on = !(state.moment && state.moment.recording);
+  say(on ? "Starting to record …" : "Completing the recording …", "busy");
+  send("record", { on });
+}
+
+$("record").onclick = record;
 $("new").onclick = add;
 $("reset").onclick = reset;
 $("grasp").onchange = (event) => regrasp(event.target.checked);
@@ -458,6 +470,7 @@ document.addEventListener("keydown", (event) => {
   if (key >= "1" && key <= "9") { const name = names()[Number(key) - 1]; if (name) choose(name); }
   else if (key === "n") add();
   else if (key === "r") reset();
+  else if (key === "s") record();
   else if (key === "g") regrasp(!$("grasp").checked);
   else if (key === "[" || key === "]") {
     $("fraction").value = Number($("fraction").value) + (key === "[" ? -0.01 : 0.01);

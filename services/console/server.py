@@ -59,6 +59,12 @@ class Forget(msgspec.Struct, tag="forget", frozen=True):
     thread: Name
 
 
+class Record(msgspec.Struct, tag="record", frozen=True):
+    """Start a recording, or complete it."""
+
+    on: bool
+
+
 class Grasp(msgspec.Struct, tag="grasp", frozen=True):
     """Show the pose at this part of the thread; None hides it."""
 
@@ -70,7 +76,7 @@ class Shown(msgspec.Struct, tag="shown", frozen=True):
     """The page has drawn the last moment and takes the next one."""
 
 
-Asked = Snap | SnapBox | Seed | Forget
+Asked = Snap | SnapBox | Seed | Forget | Record
 Order = Asked | Grasp | Shown
 _ORDERS: msgspec.json.Decoder[Order] = msgspec.json.Decoder(Order)
 
@@ -204,6 +210,8 @@ class Console:
                 found = self._feed.snap(order.view, order.u, order.v)
             elif isinstance(order, SnapBox):
                 found = self._feed.snap_box(order.view, order.corners)
+            elif isinstance(order, Record):
+                found = self._feed.record(on=order.on)
             elif isinstance(order, Forget):
                 found = self._feed.forget(order.thread)
             else:

@@ -1,0 +1,76 @@
+"""A recording that is started and stopped from the page: `suturetrack record`, as a child process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+from services.arguments import arguments_of
+from services.record import RecordConfig, fresh_folder
+from services.service import ServiceConfig
+from suturetrack.types import InputError
+
+_STOP_S = 15.0
+
+
+class Recording:
+    """At most one at a time; it ends with the console."""
+
+    def __init__(self, rig: str, zenoh: Path | None):
+        self._rig, self._zenoh = rig, zenoh
+        self._lock = threading.Lock()
+        self._child: subprocess.Popen[str] | None = None
+        self._folder = Path()
+
+    @property
+    def folder(self) -> Path | None:
+        """Where it is recorded to now."""
+        child = self._child
+        return self._folder if child is not None and child.poll() is None else None
+
+    def start(self) -> Path:
+        """Begins to record to a new folder; raises InputError when it records already."""
+        with self._lock:
+            if self.folder is not None:
+                raise InputError(f"it is recorded already, to {self._folder}")
+            self._folder = fresh_folder()
+            service = ServiceConfig(
+                self._rig, self._zenoh, run_dir=self._folder.absolute(), parent=os.getpid()
+            )
+            options = arguments_of(RecordConfig(service))
+            self._child = subprocess.Popen(
+                [sys.executable, "-m", "services.cli", "record", *options],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                start_new_session=True,
+            )
+            return self._folder
+
+    def stop(self) -> Path:
+        """Completes the recording; raises InputError when there is none, or it went wrong."""
+        with self._lock:
+            child, self._child = self._child, None
+            if child is None:
+                raise InputError("nothing is recorded")
+            if child.poll() is None:
+                child.send_signal(signal.SIGINT)
+            try:
+                _, complaint = child.communicate(timeout=_STOP_S)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                _, complaint = child.communicate()
+            if child.returncode:
+                last = complaint.strip().splitlines() or [f"status {child.returncode}"]
+                raise InputError(f"the recording to {self._folder} failed: {last[-1]}")
+            return self._folder
+
+    def close(self) -> None:
+        """Completes what still runs."""
+        if self.folder is not None:
+            self.stop()
