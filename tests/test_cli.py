@@ -12,6 +12,7 @@ import tyro
 
 from services import arguments, cli
 from services.launch import RunConfig
+from services.ros2_graph import RosConfig
 from services.segmenter import SegmenterConfig
 from services.service import ServiceConfig
 from services.source import SourceConfig
@@ -140,7 +141,22 @@ def test_a_process_refuses_a_bad_rig_name(call: Call) -> None:
 
 SERVICE = ServiceConfig("lab", Path("/net.json5"), Path("/runs/1"), "full", True, 17)
 CONFIGS: list[Any] = [
-    SourceConfig(InputConfig("a,b", Path("c.yaml"), "mm", 12.5, 40, 3, "endoscope"), SERVICE),
+    SourceConfig(
+        InputConfig(
+            "a,b",
+            Path("c.yaml"),
+            "mm",
+            scale=0.5,
+            rectified=True,
+            topics=("/l", "/r"),
+            ros=RosConfig("tcp/x:1", 3),
+            fps=12.5,
+            frames=40,
+            scene_seed=3,
+            scene_rig="endoscope",
+        ),
+        SERVICE,
+    ),
     SourceConfig(InputConfig("0")),
     SegmenterConfig(SERVICE, ((1.5, 2.25), (3.0, 4.0)), SegmentationConfig((1.0, 2.0), c=3.5)),
     TrackerConfig(
