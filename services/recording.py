@@ -21,6 +21,7 @@ import rerun as rr
 from services.drawing import Level
 from services.messages import Health
 from services.run_file import RunFile
+from services.writer import Request
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.types import RidgeField, Seed, Stamp, StereoFrame, ThreadState, Truth
@@ -128,9 +129,9 @@ class Recorder:
         """Records that a frame was worked on while there was no thread."""
         self._hand_over(lambda file: file.passed(stamp, published_ns))
 
-    def seed(self, stamp: Stamp, seed: Seed) -> None:
-        """Records a seed that came while the process ran, in metres, with the first frame it was used in."""
-        self._hand_over(lambda file: file.seed(stamp, seed))
+    def request(self, stamp: Stamp, request: Request) -> None:
+        """Records what was asked for while the process ran, in metres, at the frame it took effect."""
+        self._hand_over(lambda file: file.request(stamp, request))
 
     def initializations(
         self,

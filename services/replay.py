@@ -21,16 +21,18 @@ from services import segmenter, topics, tracker
 from services.arguments import write_config
 from services.bus import Bus, NoAnswer
 from services.memory_transport import Hub
+from services.messages import Forget
 from services.recording import Recorder
 from services.run_folder import RunFolder
 from services.segmenter import SegmenterConfig
 from services.service import Service, ServiceConfig, Stopped
 from services.tracker import TrackerConfig
+from services.writer import Request
 from suturetrack.calibration import save_calibration
 from suturetrack.initialization import InitializationConfig
 from suturetrack.segmentation import SegmentationConfig
 from suturetrack.tracking import TrackingConfig
-from suturetrack.types import InputError, RidgeField, Seed, Stamp, StereoFrame, ThreadState, Truth
+from suturetrack.types import InputError, RidgeField, Stamp, StereoFrame, ThreadState, Truth
 
 _STEP_S = 60.0
 _READY_S = 120.0
@@ -204,8 +206,8 @@ _TRACKER = _Part("tracker", "segmenter", topics.FIELD, topics.STEP)
 class _Worker:
     """A process that works anew, as a thread around a hub of its own; the others are played to it.
 
-    It is given the frames that it worked on when the run was recorded, and each seed with the frame
-    at which it took effect then.
+    It is given the frames that it worked on when the run was recorded, and each request at the
+    frame at which it took effect then.
     """
 
     def __init__(
@@ -218,7 +220,7 @@ class _Worker:
         hub = Hub()
         self.left_out = 0
         self._part, self._body = part, body
-        self._handled, self._seeds = folder.handled(part.name), folder.seeds(part.name)
+        self._handled, self._requests = folder.handled(part.name), folder.requests(part.name)
         self._bus = Bus(hub.connect(), config.rig, part.neighbour)
         rig = folder.rig()
         self._bus.answer(topics.CALIBRATION, lambda _: rig)
@@ -245,8 +247,8 @@ class _Worker:
         if self._handled and frame not in self._handled:
             self.left_out += 1
             return None
-        while self._seeds and self._seeds[0][0] <= frame:
-            self._give(self._seeds.pop(0)[1])
+        while self._requests and self._requests[0][0] <= frame:
+            self._give(self._requests.pop(0)[1])
         self.publish(self._part.takes, message)
         return self._wait_for(lambda: self._result(frame), _STEP_S)
 
@@ -258,13 +260,15 @@ class _Worker:
         """Lets the process hear something, if it is there."""
         self._bus.publish(topic, message)
 
-    def _give(self, seed: Seed) -> None:
-        if self._part is _SEGMENTER:
-            self.publish(topics.SEEDING, seed)
-        else:
-            # The question has arrived when this returns; what comes of it is in the new recording.
-            with suppress(NoAnswer):
-                self._bus.ask(topics.SEED, seed, timeout=0)
+    def _give(self, request: Request) -> None:
+        # A question has arrived when this returns; what comes of it is in the new recording.
+        with suppress(NoAnswer):
+            if isinstance(request, Forget):
+                self._bus.ask(topics.FORGET, request, timeout=0)
+            elif self._part is _SEGMENTER:
+                self.publish(topics.SEEDING, request)
+            else:
+                self._bus.ask(topics.SEED, request, timeout=0)
 
     def _result(self, frame: int) -> Any:
         result = self._results.get(0.1)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import warnings
 import weakref
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -19,7 +20,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
+from services.messages import Forget
 from services.run_file import APPLICATION, RECORDING_VERSION
+from services.writer import Request
 from suturetrack.camera import Camera, StereoRig
 from suturetrack.types import (
     Energies,
@@ -36,6 +39,7 @@ from suturetrack.types import (
     Truth,
 )
 
+T = TypeVar("T")
 Row = dict[str, Any]
 """Columns of one row, with `entity`; lists are NumPy arrays, what was not logged is missing."""
 
@@ -93,19 +97,18 @@ class RunFolder:
     def states(self) -> list[RecordedState]:
         """All states of all threads, by frame and thread."""
         rows = (row for row in self.rows("/rig/thread/**") if row["entity"].endswith("/nurbs"))
-        states = [_state(row) for row in rows]
+        states = self._parsed(rows, _state, "states")
         return sorted(states, key=lambda s: (s.state.stamp.frame, s.state.thread))
 
     def truths(self) -> list[Truth]:
         """Where the synthetic threads really were, by frame and thread; empty for real scenes."""
-        truths = [_truth(row) for row in self.rows("/rig/truth/**")]
+        truths = self._parsed(self.rows("/rig/truth/**"), _truth, "true threads")
         return sorted(truths, key=lambda t: (t.stamp.frame, t.thread))
 
-    def seeds(self, process: str) -> list[tuple[int, Seed]]:
-        """The seeds that came while a process ran, in metres, and the frames they took effect at."""
-        rows = [row for row in self.rows(f"/run/{process}/seed") if "frame" in row]
-        rows.sort(key=lambda row: (row["frame"], row["log_time"]))
-        return [(row["frame"], _seed(row)) for row in rows]
+    def requests(self, process: str) -> list[tuple[int, Request]]:
+        """What was asked for while a process ran, in metres, and the frames at which it took effect."""
+        rows = sorted(self.rows(f"/run/{process}/request"), key=lambda row: row["log_time"])
+        return self._parsed(rows, lambda row: (row["frame"], _request(row)), "requests")
 
     def handled(self, process: str) -> set[int]:
         """The frames that a process worked on; empty without its recording."""
@@ -138,6 +141,19 @@ class RunFolder:
         """All fields of a full recording in order, each read when it is asked for."""
         for stamp, left, right in self._pairs("field", _field):
             yield RidgeField(stamp, left, right)
+
+    def _parsed(self, rows: Iterable[Row], parse: Callable[[Row], T], what: str) -> list[T]:
+        """The values in the rows; what a newer version wrote in another form is left out."""
+        parsed, unknown = [], 0
+        for row in rows:
+            try:
+                parsed.append(parse(row))
+            except (KeyError, ValueError):
+                unknown += 1
+        problem = f"{unknown} {what} of an unknown form were left out"
+        if unknown and problem not in self.problems:
+            self.problems.append(problem)
+        return parsed
 
     def _pairs(
         self, name: str, read: Callable[[Row], NDArray[Any] | None]
@@ -197,11 +213,10 @@ class RunFolder:
             repaired = folder / file.name
             if _repair(file, repaired):
                 reader, _ = _reader(repaired)
-                self.problems.append(f"{file.name} is cut off; read up to there")
-            else:
+            if reader is None or not reader.recordings():
                 self.problems.append(f"{file.name} is no recording ({reason})")
-        if reader is None:
-            return None
+                return None
+            self.problems.append(f"{file.name} is cut off; read up to there")
         owners = {entry.application_id for entry in reader.recordings()}
         if owners != {APPLICATION}:
             self.problems.append(f"{file.name} is a recording of {', '.join(owners) or 'nothing'}")
@@ -215,6 +230,14 @@ class RunFolder:
                 f"recorded by a newer suturetrack (version {newest} of the recording's form, "
                 f"this one knows {RECORDING_VERSION}); read as far as it can be"
             )
+
+
+def rerun_program() -> Path:
+    """The Rerun viewer itself; `rerun` on the path only starts it, and would leave it behind."""
+    spec = find_spec("rerun_cli")
+    if spec is None or spec.origin is None:
+        raise InputError("the Rerun viewer is missing; it comes with rerun-sdk")
+    return Path(spec.origin).with_name("rerun.exe" if os.name == "nt" else "rerun")
 
 
 def _reader(file: Path) -> tuple[RrdReader | None, str]:
@@ -231,7 +254,7 @@ def _reader(file: Path) -> tuple[RrdReader | None, str]:
 
 def _repair(file: Path, repaired: Path) -> bool:
     """Copies what is whole in a file that ends in the middle of a message."""
-    command = [sys.executable, "-m", "rerun", "rrd", "merge", str(file), "-o", str(repaired)]
+    command = [str(rerun_program()), "rrd", "merge", str(file), "-o", str(repaired)]
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
@@ -313,11 +336,14 @@ def _state(row: Row) -> RecordedState:
     return RecordedState(state, int(numbers["published_ns"][0]))
 
 
-def _seed(row: Row) -> Seed:
+def _request(row: Row) -> Request:
     def place(name: str) -> Any:
         return tuple(row[name].tolist()) if name in row else None
 
-    return Seed(str(row["Seed:thread"][0]), place("Seed:pixel"), place("Seed:point_m"))
+    thread = str(row["Request:thread"][0])
+    if row["Request:kind"][0] == "Forget":
+        return Forget(thread)
+    return Seed(thread, place("Request:pixel"), place("Request:point"))
 
 
 def _truth(row: Row) -> Truth:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from services import topics
 from services.bus import Bus, Request
-from services.messages import Forgotten, SeedReply
+from services.messages import Forget, Forgotten, SeedReply
 from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
@@ -80,14 +80,19 @@ class SeedDesk:
                 taken.append(request.question)
         return taken
 
-    def take_forgets(self) -> None:
-        """Drops the threads that somebody wants to be dropped."""
+    def take_forgets(self) -> list[Forget]:
+        """Drops the threads that somebody wants to be dropped; those that there were."""
+        taken = []
         while (request := self._forgets.get(0)) is not None:
             thread = request.question.thread
             case = self._cases.pop(thread, None)
             if case is not None:
                 _answer(case, SeedReply(thread, False, "the thread was dropped"))
-            request.answer(Forgotten(thread, self._tracker.forget(thread)))
+            known = self._tracker.forget(thread)
+            request.answer(Forgotten(thread, known))
+            if known:
+                taken.append(request.question)
+        return taken
 
     def settle(
         self, stamp: Stamp, results: Mapping[str, Initialization | InitializationError]

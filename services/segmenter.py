@@ -70,7 +70,7 @@ def run(service: Service, config: SegmenterConfig) -> None:
                 segmenter.learn(frame, place)
             while (seed := seedings.get(0)) is not None:
                 segmenter.learn(frame, scaled(seed, 1 / rig.metres_per_unit))
-                recorder.seed(frame.stamp, seed)
+                recorder.request(frame.stamp, seed)
             ridges = segmenter.step(frame)
         except InputError as error:
             frames.refuse(str(error))

@@ -62,8 +62,9 @@ def run(service: Service, config: TrackerConfig) -> None:
         if gate.began_anew:
             desk.resume(given)
         for seed in desk.take_requests():
-            recorder.seed(ridges.stamp, seed)
-        desk.take_forgets()
+            recorder.request(ridges.stamp, seed)
+        for forget in desk.take_forgets():
+            recorder.request(ridges.stamp, forget)
         step = tracker.step(ridges)
         for state in step.states:
             bus.publish(topics.STATE, scaled(state, rig.metres_per_unit))

@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 from services import drawing
 from services.blueprint import blueprint
 from services.drawing import Entry, Level
-from services.messages import Health
+from services.messages import Forget, Health
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
@@ -27,6 +27,8 @@ from suturetrack.types import (
     Truth,
 )
 
+Request = Seed | Forget
+"""What an operator asks of the processes, lengths in metres."""
 _LANE_FRAMES = 10
 
 
@@ -83,13 +85,14 @@ class Writer:
         """Records that a frame was worked on while there was no thread."""
         self._latency(stamp, published_ns)
 
-    def seed(self, stamp: Stamp, seed: Seed) -> None:
-        """Records a seed that came while the process ran, in metres, with the first frame it was used in."""
+    def request(self, stamp: Stamp, request: Request) -> None:
+        """Records what was asked for while the process ran, in metres, at the frame it took effect."""
         # In metres, as it came: a replay to the bit must not round it.
-        place = {"pixel": seed.pixel} if seed.point is None else {"point_m": seed.point}
-        numbers = {"thread": seed.thread, **place}
-        self.write(stamp, [(f"/run/{self.process}/seed", drawing.values("Seed", numbers))])
-        self.log(f"thread {seed.thread}: a seed came")
+        numbers = {key: value for key, value in vars(request).items() if value is not None}
+        kind = type(request).__name__
+        entity = f"/run/{self.process}/request"
+        self.write(stamp, [(entity, drawing.values("Request", {"kind": kind, **numbers}))])
+        self.log(f"{kind.lower()} for thread {request.thread} came")
 
     def initializations(
         self,

@@ -15,6 +15,7 @@ from services import segmenter, topics, tracker
 from services.arguments import write_config
 from services.bus import Bus, NoAnswer
 from services.memory_transport import Hub
+from services.messages import Forget
 from services.recording import Recorder
 from services.replay import Parameters, ReplayConfig, changed, run
 from services.run_folder import RecordedState, RunFolder
@@ -89,9 +90,11 @@ def seeded(tmp_path_factory: pytest.TempPathFactory) -> Path:
             recorder.frame(frame)
             if i in (2, 6):
                 continue  # the segmenter never sees it
-            if i in seeds:
-                with suppress(NoAnswer):
+            with suppress(NoAnswer):
+                if i in seeds:
                     bus.ask(topics.SEED, seeds[i], timeout=0)
+                if i == 7:
+                    bus.ask(topics.FORGET, Forget("b"), timeout=0)
             bus.publish(topics.FRAME, frame)
             step = steps.get(60)
             assert step is not None
@@ -121,7 +124,7 @@ def processes(hub: Hub, config: ServiceConfig, rig: StereoRig) -> Iterator[Bus]:
     for thread in threads:
         thread.start()
     for name in bodies:
-        assert bus.wait_for_alive(name, 60)
+        assert bus.wait_for_alive(name, 120)
     yield bus
     for service in services.values():
         service.bus.stop.set()
@@ -143,10 +146,9 @@ def test_seeds_sent_live_take_effect_at_the_same_frames_again(
     tmp_path: Path, seeded: Path, first: Literal["segmenter", "tracker"]
 ) -> None:
     folder = RunFolder(seeded)
-    assert [(frame, s.thread) for frame, s in folder.seeds("tracker")] == [
-        *((1, "a"), (3, "b"), (5, "a"))
-    ]
-    assert [frame for frame, _ in folder.seeds("segmenter")] == [3, 4, 7]
+    asked = [(frame, type(r).__name__, r.thread) for frame, r in folder.requests("tracker")]
+    assert asked == [(1, "Seed", "a"), (3, "Seed", "b"), (5, "Seed", "a"), (7, "Forget", "b")]
+    assert [frame for frame, _ in folder.requests("segmenter")] == [3, 4, 7]
     states = named_bits(seeded)
     assert [(frame, name) for frame, name, *_ in states] == [
         *((1, "a"), (3, "a"), (3, "b"), (4, "a"), (4, "b"), (5, "a"), (5, "b"), (7, "a"), (7, "b"))
@@ -154,9 +156,12 @@ def test_seeds_sent_live_take_effect_at_the_same_frames_again(
     again = tmp_path / "again"
     run(ReplayConfig(seeded, again, first, recording="full"))
     assert named_bits(again) == states
-    assert [(f, s.thread, s.point) for f, s in RunFolder(again).seeds("tracker")] == [
-        (f, s.thread, s.point) for f, s in folder.seeds("tracker")
+    places = [
+        [getattr(r, "point", None) for _, r in RunFolder(d).requests("tracker")]
+        for d in (again, seeded)
     ]
+    assert places[0] == places[1]
+    assert places[0][2] is not None
     run(ReplayConfig(again, tmp_path / "once more", "tracker"))
     assert named_bits(tmp_path / "once more") == states
 

@@ -9,13 +9,14 @@ import numpy as np
 import rerun as rr
 from rerun.components import MarkerShape
 
-from services.drawing.common import GREEN, RED, TURQUOISE, WHITE, YELLOW, Entry, part
+from services.drawing.common import GRAY, GREEN, RED, TURQUOISE, WHITE, YELLOW, Entry, part
 from suturetrack.types import ThreadState
 
 MARKS = {
     "lost": (RED, MarkerShape.Cross),
     "found": (GREEN, MarkerShape.Up),
     "seed": (WHITE, MarkerShape.Diamond),
+    "forgotten": (GRAY, MarkerShape.Down),
     "inserted": (TURQUOISE, MarkerShape.Plus),
     "removed": (YELLOW, MarkerShape.Square),
 }
@@ -40,8 +41,8 @@ def kinds(state: ThreadState, *, seeded: bool) -> list[str]:
     for event in state.events:
         if event in _FOUND:
             found.add("found")
-        elif event == "lost":
-            found.add("lost")
+        elif event in ("lost", "forgotten"):
+            found.add(event)
         elif (counts := _CONTROL_POINTS.fullmatch(event)) is not None:
             names = zip(("inserted", "removed"), counts.groups(), strict=True)
             found |= {name for name, count in names if count != "0"}
