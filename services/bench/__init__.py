@@ -9,11 +9,21 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from services.bench import faults, initialization, latency, load, report, segmentation, tracking
+from services.bench import (
+    faults,
+    initialization,
+    latency,
+    load,
+    recording,
+    report,
+    segmentation,
+    tracking,
+)
 from services.bench.faults import FaultsBench
 from services.bench.initialization import InitializationBench
 from services.bench.latency import LatencyBench
 from services.bench.load import LoadBench
+from services.bench.recording import RecordingBench
 from services.bench.report import Plot
 from services.bench.segmentation import SegmentationBench
 from services.bench.tracking import TrackingBench
@@ -34,6 +44,11 @@ _PLOTS = {
     ),
     "segmentation": (Plot("pair_ms", "filter", logarithmic=True), Plot("f1", "filter")),
     "latency": (Plot("p50_ms", "process"), Plot("p99_ms", "process")),
+    "recording": (
+        Plot("ratio", "process"),
+        Plot("loop_ms", "process"),
+        Plot("kilobytes", "process", logarithmic=True),
+    ),
     "load": (Plot("rate_hz", "load", reference="asked_hz"), Plot("latency_p99_ms", "load")),
     "faults": (
         Plot("stale_max_ms", "fault", reference="limit_ms"),
@@ -52,6 +67,7 @@ class BenchConfig:
         | Annotated[InitializationBench, tyro.conf.subcommand("initialization")]
         | Annotated[SegmentationBench, tyro.conf.subcommand("segmentation")]
         | Annotated[LatencyBench, tyro.conf.subcommand("latency")]
+        | Annotated[RecordingBench, tyro.conf.subcommand("recording")]
         | Annotated[FaultsBench, tyro.conf.subcommand("faults")]
         | Annotated[LoadBench, tyro.conf.subcommand("load")],
         tyro.conf.arg(name=""),
@@ -76,6 +92,8 @@ def run(config: BenchConfig) -> None:
             name, table = "segmentation", [*segmentation.run(config.what, console)]
         case LatencyBench():
             name, table = "latency", [*latency.run(config.what, console)]
+        case RecordingBench():
+            name, table = "recording", [*recording.run(config.what, console)]
         case LoadBench():
             name, table = "load", [*load.run(config.what, console)]
         case FaultsBench():
