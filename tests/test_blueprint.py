@@ -184,6 +184,9 @@ def test_the_viewer_shows_the_curve_on_the_thread(
 
     with headless_viewer(tmp_path) as client:
         _wait_until(lambda: green_share() > 1e-3)
-        state = client.get_state()
-    assert len(state.views) > 10
-    assert [report for view in state.views for report in view.reports] == []
+        for frame in (FRAMES - 1, FRAMES // 2, 0):
+            client.set_time("frame", sequence=frame, play_state="paused")
+            client.save_screenshot(str(picture))
+            state = client.get_state()
+            assert len(state.views) > 10
+            assert [report for view in state.views for report in view.reports] == []
