@@ -184,10 +184,11 @@ def _halted(pid: int, tasks: list[int]) -> Iterator[None]:
             seized.append(task)
         for task in seized:
             ptrace(_INTERRUPT, task, None, None)
+        for task in seized:
+            os.waitpid(task, _WALL)
         yield
     finally:
         for task in seized:
-            os.waitpid(task, _WALL)
             ptrace(_DETACH, task, None, None)
 
 
