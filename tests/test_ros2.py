@@ -412,7 +412,7 @@ def test_image_topics_are_a_source_that_recovers_from_silence(router: str, quick
         stamps.append(exposure.capture_ns)
     assert np.diff(stamps).min() > 0
     cameras.paused.set()
-    assert "no pair of images" in stall_of(footage)
+    assert "no pair of images (they used to come) for " in stall_of(footage)
     cameras.paused.clear()
     assert footage.read(4) is not None
     footage.close()
@@ -423,8 +423,8 @@ def test_image_topics_are_a_source_that_recovers_from_silence(router: str, quick
     ("options", "words"),
     [
         (
-            {"late_ns": 10**9},
-            r"stamps are \d+\.\d ms apart, more than --slop-ms 10|no pair of images",
+            {"late_ns": 10**10},
+            r"stamps are \d+\.\d ms apart, more than --slop-ms 10",
         ),
         ({"encoding": "mono16"}, "images are 'mono16'; convert them"),
         ({"info": False}, "nothing came on .*left/camera_info and .*; give --calibration FILE"),
@@ -449,7 +449,7 @@ def test_no_topics_no_publisher_and_no_router_are_told(
     with pytest.raises(InputError, match="topic 'left': ROS topics are like"):
         open_input(InputConfig("ros2:left,right", ros=config))
     with pytest.raises(
-        InputError, match="only one of the two sides sends images; is somebody publishing"
+        InputError, match="at most one of the two sides sends images; is somebody publishing"
     ):
         open_input(InputConfig(f"ros2:{LEFT},{RIGHT}", ros=config))
     with pytest.raises(InputError, match="no ROS 2 graph at tcp/"):

@@ -60,7 +60,9 @@ class Pairing(Generic[T]):
     def advice(self) -> str:
         """Why there are no pairs, and what would help."""
         if self.closest_ns is None:
-            return "only one of the two sides sends images"
+            return "at most one of the two sides sends images"
+        if self.closest_ns <= self._slop_ns:
+            return "they used to come"
         apart, slop = self.closest_ns / 1e6, self._slop_ns / 1e6
         return (
             f"the nearest left and right stamps are {apart:.1f} ms apart, more than --slop-ms "

@@ -58,7 +58,9 @@ class Ros2Footage:
             self._first: Exposure | None = self._newest.get(_FIRST_S, self._where)
         except Stalled as stall:
             self.close()
-            raise InputError(f"{self._complaint()}; is somebody publishing?") from stall
+            raise InputError(
+                f"{self._where}: no pair of images; {self._pairing.advice()}; is somebody publishing?"
+            ) from stall
         except InputError:
             self.close()
             raise
@@ -76,10 +78,7 @@ class Ros2Footage:
         if index == 0 and self._first is not None:
             return self._first
         self._first = None
-        try:
-            exposure = self._newest.get(STALL_S, self._where)
-        except Stalled as stall:
-            raise Stalled(self._complaint()) from stall
+        exposure = self._newest.get(STALL_S, self._complaint())
         if (exposure.left.shape[1], exposure.left.shape[0]) != self.size:
             raise InputError(f"{self._where}: images are {exposure.left.shape}, were {self.size}")
         return exposure
@@ -93,7 +92,7 @@ class Ros2Footage:
         return f"source ros2:{','.join(self.topics)}"
 
     def _complaint(self) -> str:
-        return f"{self._where}: no pair of images; {self._pairing.advice()}"
+        return f"{self._where}: no pair of images ({self._pairing.advice()})"
 
     def _subscribe(self, *, wants_rig: bool) -> None:
         for right, topic in enumerate(self.topics):
