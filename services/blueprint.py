@@ -29,7 +29,7 @@ def blueprint(threads: Sequence[str], target: Float64) -> rrb.Blueprint:
             ),
             _curve(names),
             _segmentation(),
-            _initialization(),
+            _initialization(names),
             _processes(),
             _parameters(),
         ),
@@ -92,10 +92,15 @@ def _each(names: Sequence[str], *quantities: str) -> list[str]:
     return [f"/plots/{name}/{quantity}" for name in names for quantity in quantities]
 
 
-def _initialization() -> rrb.Container:
+def _initialization(names: Sequence[str]) -> rrb.Container:
     """The last growth over the field in which it happened, and what came of it."""
     views = (_view(view, "/growth/**") for view in VIEWS)
-    words = rrb.TextDocumentView(origin="/log/initialization/0", name="Outcome")
+    words = rrb.Vertical(
+        *(
+            rrb.TextDocumentView(origin=f"/log/initialization/{n}", name=f"Thread {n}")
+            for n in names
+        )
+    )
     return rrb.Horizontal(*views, words, column_shares=[4, 4, 2], name="Initialisation")
 
 

@@ -118,7 +118,10 @@ def _lines(
     rejected, reasons = [line for line, _ in view.rejected], [why for _, why in view.rejected]
     yield f"{root}/segments", rr.LineStrips2D(raw(view.segments), colors=GREEN, radii=-1.0)
     yield f"{root}/merges", rr.LineStrips2D(raw(view.merges), colors=AMBER, radii=-2.0)
-    yield f"{root}/rejected", rr.LineStrips2D(raw(rejected), colors=RED, radii=-1.5, labels=reasons)
+    yield (
+        f"{root}/rejected",
+        rr.LineStrips2D(raw(rejected), colors=RED, radii=-1.5, labels=reasons, draw_order=25),
+    )
     yield f"{root}/marks", rr.Points2D(raw([marks])[0], colors=WHITE, radii=-2.5)
 
 
