@@ -35,6 +35,7 @@ _CHORD = 6
 _CLEARER = 0.1
 _INWARD = 5.0
 _DAMPING = 1e-3
+_BESIDE = {0: 1, -1: -2}
 
 
 def fit(
@@ -53,11 +54,12 @@ def fit(
     samples = Samples.at(curve.knots, evenly_spaced(curve, count))
     sums = spline.gather(samples.first, samples.table[0], np.ones((count, 1)))
     control_points = curve.control_points
+    nearest = [_gap(control_points, end) / 3 for end in (0, -1)]
     for _ in range(config.iterations):
         step = _point_offsets(samples, control_points, field, rig, cutoffs, config)
         change = spline.gather(samples.first, samples.table[0], step) / np.maximum(sums, 1e-9)
-        change[0] = _short_of(step[0], control_points[1] - control_points[0])
-        change[-1] = _short_of(step[-1], control_points[-2] - control_points[-1])
+        for end, least in zip((0, -1), nearest, strict=True):
+            change[end] = _short_of(step[end], control_points, end, least)
         control_points = control_points + change
     return curve_from(curve.degree, curve.knots, control_points)
 
@@ -181,13 +183,19 @@ def _deproject_end(
     return step
 
 
-def _short_of(step: Float64, neighbour: Float64) -> Float64:
-    """The step of an end, kept from passing its neighbour: the tangent there would turn round, and
-    the end would run back along the thread.
+def _short_of(step: Float64, control_points: Float64, end: int, least: float) -> Float64:
+    """The step of an end, cut so that it stays `least` short of its neighbour.
+
+    Were it to pass, the tangent there would turn round, and the end would run back along the thread.
     """
-    gap = max(float(np.linalg.norm(neighbour)), 1e-12)
-    toward = neighbour / gap
-    return step - max(float(step @ toward) - gap / 3, 0.0) * toward
+    gap = _gap(control_points, end)
+    toward = (control_points[_BESIDE[end]] - control_points[end]) / max(gap, 1e-12)
+    nearer, room = float(step @ toward), max(gap - least, 0.0)
+    return step * room / nearer if nearer > room else step
+
+
+def _gap(control_points: Float64, end: int) -> float:
+    return float(np.linalg.norm(control_points[_BESIDE[end]] - control_points[end]))
 
 
 def _across(tangent: Float64) -> Float64:
