@@ -126,6 +126,17 @@ class StereoRig:
         """Distance of the cameras, calibration's unit."""
         return float(-self.right.projection[0, 3] / self.right.projection[0, 0])
 
+    def reduced(self, scale: int) -> StereoRig:
+        """The rig for rectified images of which only every `scale`-th pixel is kept, from the first."""
+        shrink = np.diag([1 / scale, 1 / scale, 1.0])
+        left, right = (
+            replace(c, matrix=shrink @ c.matrix, projection=shrink @ c.projection)
+            for c in (self.left, self.right)
+        )
+        width, height = self.image_size
+        size = -(-width // scale), -(-height // scale)
+        return StereoRig(size, left, right, self.metres_per_unit)
+
     @cached_property
     def is_rectified(self) -> bool:
         """Whether raw pixels are rectified pixels."""

@@ -66,6 +66,25 @@ def test_the_whole_thread_is_found_from_its_middle(rig: StereoRig, curve: Nurbs)
     assert found.reprojection_px < 0.2
 
 
+@pytest.mark.parametrize("width", [4, 7, 10])
+def test_the_width_of_the_thread_does_not_matter(rig: StereoRig, curve: Nurbs, width: int) -> None:
+    truth = dense(curve)
+    views = [draw(pixels, rig, width=width) for pixels in rig.project(truth)]
+    frame = StereoFrame(STAMP, *views)
+    seed = Seed(pixel=tuple(rig.project(truth[700])[0]))
+    segmenter = Segmenter(rig)
+    segmenter.learn(frame, seed)
+    found = initialize(segmenter.step(frame), rig, seed)
+    error = curve_error(dense(found.curve), truth)
+    assert error.mean < 0.5
+    assert abs(error.length_percent) < 3
+    assert found.growth.left.cost.shape == (480, 640)
+    u, v = np.rint(rig.project(truth[700])[0]).astype(int)
+    assert np.isfinite(found.growth.left.cost[v, u])
+    marked = found.growth.marks[:, 0]
+    assert polyline_distances(marked, rig.project(truth)[0]).max() < width
+
+
 def test_a_seed_on_nothing_is_refused_with_the_nearest_ridge(rig: StereoRig, curve: Nurbs) -> None:
     field = field_of_curve(curve, rig)
     with pytest.raises(InitializationError, match="no thread within 8 px") as refusal:
@@ -199,6 +218,15 @@ def test_ends_cut_by_the_border_are_reported(rig: StereoRig) -> None:
     field = field_of(draw(left, rig), draw(right, rig), rig)
     found = initialize(field, rig, Seed(pixel=tuple(inside[len(inside) // 2])))
     assert any("cut by the image border" in reason for reason in found.reasons)
+
+
+def test_a_thread_along_the_epipolar_lines_is_not_relied_on(rig: StereoRig) -> None:
+    line = np.linspace([-40.0, -5, 195], [30.0, -3, 205], 1500)
+    left, right = rig.project(line)
+    field = field_of(draw(left, rig), draw(right, rig), rig)
+    found = initialize(field, rig, Seed(pixel=tuple(left[700])))
+    assert found.confidence < 0.5
+    assert any("uncertain depth" in reason for reason in found.reasons)
 
 
 def test_views_that_disagree_lower_the_confidence(rig: StereoRig, curve: Nurbs) -> None:

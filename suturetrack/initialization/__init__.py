@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from suturetrack.camera import StereoRig
@@ -18,8 +20,8 @@ from suturetrack.initialization.model import (
     InitializationError,
     ViewGrowth,
 )
-from suturetrack.initialization.segments import Ridges, find_ridges
-from suturetrack.types import Float64, InputError, RidgeField, Seed
+from suturetrack.initialization.segments import Ridges, find_ridges, thread_scale
+from suturetrack.types import Float32, Float64, InputError, RidgeField, Seed
 
 __all__ = [
     "Growth",
@@ -49,29 +51,62 @@ def initialize(
         InitializationError: there is no thread at the seed, or none like it in the right view.
     """
     pixel = seed_pixel(seed, rig)
-    ridges = find_ridges(field.left, config), find_ridges(field.right, config)
+    left = find_ridges(field.left, config)
+    scale = thread_scale(left, pixel)
+    if scale == 1:
+        return _initialize(field, left, rig, pixel, config, 1)
+    # A wide thread is looked at from farther away: all that follows is made for a narrow one.
+    reduced = RidgeField(field.stamp, *(_reduced(v, scale) for v in (field.left, field.right)))
+    try:
+        left = find_ridges(reduced.left, config)
+        found = _initialize(reduced, left, rig.reduced(scale), pixel / scale, config, scale)
+    except InitializationError as error:
+        growth = None if error.growth is None else error.growth.enlarged(scale, field.left.shape)
+        raise InitializationError(error.reason, scale * error.candidates, growth) from None
+    return replace(
+        found,
+        reprojection_px=scale * found.reprojection_px,
+        growth=found.growth.enlarged(scale, field.left.shape),
+    )
+
+
+def _initialize(
+    field: RidgeField,
+    left: Ridges,
+    rig: StereoRig,
+    pixel: Float64,
+    config: InitializationConfig,
+    scale: int,
+) -> Initialization:
+    """As `initialize`, in a field reduced by `scale`; only texts have pixels of the whole image."""
+    ridges = left, find_ridges(field.right, config)
     origin, candidates = nearest_segment(ridges[0], pixel, config.snap_px)
     if origin is None:
-        raise InitializationError(_nothing_there(candidates, pixel, config), candidates)
+        reason = _nothing_there(scale * candidates, scale * pixel, config)
+        raise InitializationError(reason, candidates)
     nearest = float(rig.left.projection[0, 2] - rig.right.projection[0, 2])
     found = find_thread(field, ridges, origin, pixel, nearest, config)
     pixels = found.pixels
-    growths = _growths(found, ridges[1], pixel, config)
     step = max(1, round(config.step_px))
-    growth = Growth(*growths, pixels[::step].reshape(-1, 2, 2))
+    marks = pixels[::step].reshape(-1, 2, 2)
+    growth = Growth(*_growths(found, ridges[1], pixel, config), marks)
     if len(pixels) < _SHORTEST_STEPS * step:
-        reason = f"the ridge at the seed is only {len(pixels)} px long"
+        reason = f"the ridge at the seed is only {scale * len(pixels)} px long"
         raise InitializationError(reason, candidates, growth)
-    if np.median(found.matched.response) < _LEAST_MATCH:
+    if not _is_matched(found.matched):
         swapped = match(found.left.chain, field.left, field.right, nearest, -1)
         raise InitializationError(_no_match(swapped), candidates, growth)
     pixels = _trim(pixels, field)
     s = image_parameters(pixels[:, :2], pixels[:, 2:])
     points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
     curve = fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
-    curve, samples = refine(curve, (field.left, field.right), rig)
-    confidence, reasons = judge(curve, samples, found.chains, rig)
+    curve, samples, sigma = refine(curve, (field.left, field.right), rig)
+    confidence, reasons = judge(curve, samples, sigma, found.chains, rig, scale)
     return Initialization(curve, confidence, reasons, samples.distance_px, growth)
+
+
+def _reduced(view: Float32, scale: int) -> Float32:
+    return np.ascontiguousarray(view[::scale, ::scale])
 
 
 def seed_pixel(seed: Seed, rig: StereoRig) -> Float64:
@@ -117,9 +152,14 @@ def _growths(
     return left, grow_thread(found.right, there, config)
 
 
+def _is_matched(matched: Match) -> bool:
+    response = matched.response[matched.inside]
+    return bool(len(response) and np.median(response) >= _LEAST_MATCH)
+
+
 def _no_match(swapped: Match) -> str:
     reason = "the right view shows no thread along the epipolar lines of the left one"
-    if np.median(swapped.response) >= _LEAST_MATCH:
+    if _is_matched(swapped):
         reason += ", but it does on the other side: left and right are swapped"
     return reason
 

@@ -16,19 +16,29 @@ _AGREED = 0.95
 _NEAR_PX = 3.0
 _SEEN = 0.1
 """Response from which a crest counts as seen."""
+_VAGUE = 0.0125
+"""Standard deviation of the best quarter of a curve, against its length, that halves the confidence:
+single stretches along the epipolar lines are held by the rest, a whole thread along them is not."""
 _SAME_PLACE_PX = 25.0
 
 
 def judge(
-    curve: Nurbs, samples: Samples, chains: tuple[Chain, Chain], rig: StereoRig
+    curve: Nurbs,
+    samples: Samples,
+    sigma: Float64,
+    chains: tuple[Chain, Chain],
+    rig: StereoRig,
+    scale: int,
 ) -> tuple[float, tuple[str, ...]]:
     """Confidence in [0, 1] and its reasons.
 
     Args:
         curve: the result.
         samples: what the images say beside it.
+        sigma: (k,) standard deviations of the samples.
         chains: the thread as each view by itself has it; their agreement is what counts most.
         rig: the cameras.
+        scale: what makes the pixels of all these those of the whole image.
     """
     reasons = []
     pixels = rig.project(nurbs.evaluate(curve, np.linspace(0, 1, 8 * len(curve.control_points))))
@@ -39,11 +49,18 @@ def judge(
     if seen < 0.95:
         reasons.append(f"uncertain stretches: {1 - seen:.0%} of the thread is not seen")
     confidence = agreement**2 * seen
+    vague = float(np.quantile(sigma, 0.25)) / nurbs.length(curve)
+    if vague > _VAGUE / 2:
+        reasons.append(f"uncertain depth: even its best parts to {vague:.1%} of the length only")
+    confidence /= 1 + (vague / _VAGUE) ** 6
     lowest = 1.0
     for name, chain in zip(("left", "right"), chains, strict=True):
         doubts = _distinct(chain)
         lowest = min(lowest, clarity(chain))
-        reasons += [f"{why} in the {name} view at ({u:.0f}, {v:.0f})" for (u, v), why, _ in doubts]
+        reasons += [
+            f"{why} in the {name} view at ({scale * u:.0f}, {scale * v:.0f})"
+            for (u, v), why, _ in doubts
+        ]
     # Two views that come to the same by themselves are not both mistaken easily.
     confidence *= np.sqrt(lowest) if agreement >= _AGREED else lowest
     for end in (0, 1):

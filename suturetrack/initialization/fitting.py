@@ -33,6 +33,8 @@ _UNSEEN = 0.02
 _STIFFEST = 1e9
 _RIDGE = 1e-9
 _END_NOISE_PX = 0.2
+_ROW_NOISE_PX = 0.1
+"""By how much the rows of two calibrated views are off, px."""
 _LARGEST_END_STEP_PX = 2.0
 _BEND_SAMPLES = 8.0
 """Samples over which the visible bending is averaged."""
@@ -115,7 +117,9 @@ class Samples:
         return float(np.sqrt(squares / max(sum(c.trust.sum() for c in self.crests), 1e-9)))
 
 
-def refine(curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig) -> tuple[Nurbs, Samples]:
+def refine(
+    curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig
+) -> tuple[Nurbs, Samples, Float64]:
     """Gauss-Newton on the crests of both views, as smooth as the evidence says, with few knots.
 
     Bending is measured in pixels, across the line of sight and in disparity apart, because the
@@ -126,6 +130,9 @@ def refine(curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig) -> tup
         curve: within a few pixels of the crests, with knots enough for any shape.
         fields: (H, W, 2) left and right.
         rig: the cameras.
+
+    Returns:
+        The curve, what the images show beside it, and (k,) the standard deviations of its samples.
     """
     stiffness = np.array([1.0, 100.0])
     for _ in range(_DENSE_ROUNDS):
@@ -133,7 +140,30 @@ def refine(curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig) -> tup
     curve = with_needed_knots(Samples.of(curve, fields, rig))
     for _ in range(_FINAL_ROUNDS):
         curve, stiffness = _step(curve, Samples.of(curve, fields, rig), stiffness)
-    return curve, Samples.of(curve, fields, rig)
+    samples = Samples.of(curve, fields, rig)
+    return curve, samples, deviations(curve, samples, stiffness)
+
+
+def deviations(curve: Nurbs, samples: Samples, stiffness: Float64) -> Float64:
+    """(k,) standard deviations of the samples in space: by the noise of the crests, and by rows of
+    the two views that are not quite those of the calibration."""
+    noise = max(samples.noise_px, _LEAST_NOISE_PX) ** 2
+    data, pull = _crest_equations(curve, samples)
+    _add_ends(data, pull, samples, noise)
+    across, bends = _bending_equations(curve, samples)
+    factor = data / noise + stiffness[0] * across + stiffness[1] * bends
+    if not spline.factorize(factor):
+        raise FloatingPointError("the curve is not held by the images")
+    first, table = spline.local_basis(samples.s, curve.knots)
+    covariance = spline.sample_covariance(first, table[0], spline.band_of_inverse(factor))
+    band, gradient = _empty(curve)
+    crest, jacobian = samples.crests[1], samples.jacobians[1]
+    rows = np.einsum("ki,kij->kj", crest.normals, jacobian)
+    slip = (crest.trust * crest.normals[:, 1])[:, None] * rows
+    spline.add_rows(first, table[0], np.zeros((len(rows), 3, 3)), slip, band, gradient)
+    step = _ROW_NOISE_PX * spline.solve_factorized(factor, gradient / noise)
+    moved = spline.combine(first, table[0], step.reshape(-1, 3))
+    return np.sqrt(np.trace(covariance, axis1=1, axis2=2) + (moved**2).sum(1))
 
 
 def with_needed_knots(samples: Samples) -> Nurbs:

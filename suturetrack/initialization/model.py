@@ -38,6 +38,16 @@ class ViewGrowth:
     rejected: tuple[tuple[Float64, str], ...]
     """Segments that are no part of the thread, and why."""
 
+    def enlarged(self, scale: int, shape: tuple[int, ...]) -> ViewGrowth:
+        """The same in the pixels of the whole image, (H, W, ...), that was reduced by `scale`."""
+        cost = self.cost.repeat(scale, axis=0).repeat(scale, axis=1)[: shape[0], : shape[1]]
+        return ViewGrowth(
+            cost,
+            tuple(scale * s for s in self.segments),
+            scale * self.merges,
+            tuple((scale * s, why) for s, why in self.rejected),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Growth:
@@ -47,6 +57,11 @@ class Growth:
     right: ViewGrowth
     marks: Float64
     """(k, 2, 2) left and right pixel of each mark, from end to end of the thread."""
+
+    def enlarged(self, scale: int, shape: tuple[int, ...]) -> Growth:
+        """The same in the pixels of the whole image, (H, W, ...), that was reduced by `scale`."""
+        left, right = (view.enlarged(scale, shape) for view in (self.left, self.right))
+        return Growth(left, right, scale * self.marks)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from scipy.ndimage import minimum_filter1d
 from scipy.spatial import cKDTree
 
 from suturetrack.initialization.model import InitializationConfig
-from suturetrack.kernels import crest
+from suturetrack.kernels import crest, search
 from suturetrack.types import Float32, Float64
 
 Int64 = NDArray[np.int64]
@@ -30,6 +30,12 @@ _HEADING = 6
 _KINK_REACH = 5
 _KINK = 0.6
 """Cosine of the turn, over `_KINK_REACH` points to both sides, from which a segment has a kink."""
+_WIDTH_REACH = 40
+"""Points of a segment, on each side of the seed, whose width counts."""
+_STEP_ACROSS = 0.5
+_ACROSS = np.arange(-12.0, 12.01, _STEP_ACROSS)
+_NARROW_PX = 1.4
+"""How far from its crest the ridge of a narrow thread is half as high, px."""
 _NOISE_QUANTILE = 0.9
 _ABOVE_NOISE = 2.0
 _MOST_CREST = 1 / 16
@@ -78,6 +84,34 @@ def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
         if b - a >= _SHORTEST and (b - a >= ARM or strength[a:b].max() >= config.high)
     )
     return Ridges(field, magnitude, split_at_touches(segments), low)
+
+
+def thread_scale(ridges: Ridges, seed: Float64) -> int:
+    """How many times wider than a narrow thread the ridge nearest to the seed (2,) is, 1 at least."""
+    segments = [s for s in ridges.segments if len(s) >= ARM]
+    if not segments:
+        return 1
+    distances = [np.linalg.norm(s - seed, axis=1) for s in segments]
+    nearest = int(np.argmin([d.min() for d in distances]))
+    at = int(np.argmin(distances[nearest]))
+    segment = segments[nearest][max(at - _WIDTH_REACH, 0) : at + _WIDTH_REACH]
+    tangents = np.gradient(segment, axis=0)
+    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+    profiles = search.normal_profiles(ridges.field, segment, tangents, _ACROSS)
+    profile = np.median(profiles, axis=0)
+    middle = len(_ACROSS) // 2
+    width = (_half_width(profile[middle:]) + _half_width(profile[middle::-1])) / 2
+    return max(round(width / _NARROW_PX), 1)
+
+
+def _half_width(profile: Float64) -> float:
+    """Where a profile has fallen from its first value to half of that, px."""
+    below = np.flatnonzero(profile < profile[0] / 2)
+    if len(below) == 0:
+        return _STEP_ACROSS * len(profile)
+    k = int(below[0])
+    over = (profile[k - 1] - profile[0] / 2) / max(profile[k - 1] - profile[k], 1e-9)
+    return float(_STEP_ACROSS * (k - 1 + over))
 
 
 def split_at_touches(segments: tuple[Float64, ...]) -> tuple[Float64, ...]:
