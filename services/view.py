@@ -9,7 +9,6 @@ import sys
 import uuid
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +19,7 @@ from services import topics
 from services.bus import Bus, NoAnswer
 from services.live import LiveView
 from services.run_file import APPLICATION
-from services.run_folder import RunFolder
+from services.run_folder import RunFolder, rerun_program
 from services.service import ServiceConfig
 from services.service import run as run_service
 from suturetrack.types import InputError
@@ -92,12 +91,4 @@ def files(folder: RunFolder) -> list[str]:
 def command(web: bool, *arguments: str) -> list[str]:
     """The viewer's own command line."""
     options = ["--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
-    return [str(viewer()), *options, *arguments]
-
-
-def viewer() -> Path:
-    """The viewer itself; `rerun` on the path only starts it, and would leave it behind."""
-    spec = find_spec("rerun_cli")
-    if spec is None or spec.origin is None:
-        raise InputError("the Rerun viewer is missing; it comes with rerun-sdk")
-    return Path(spec.origin).with_name("rerun.exe" if os.name == "nt" else "rerun")
+    return [str(rerun_program()), *options, *arguments]
