@@ -153,8 +153,7 @@ def _growths(
 
 
 def _is_matched(matched: Match) -> bool:
-    response = matched.response[matched.inside]
-    return bool(len(response) and np.median(response) >= _LEAST_MATCH)
+    return bool(np.median(matched.response) >= _LEAST_MATCH)
 
 
 def _no_match(swapped: Match) -> str:
