@@ -106,7 +106,10 @@ def _initialize(
 
 
 def _reduced(view: Float32, scale: int) -> Float32:
-    return np.ascontiguousarray(view[::scale, ::scale])
+    reduced = np.ascontiguousarray(view[::scale, ::scale])
+    # As fields from the wire are: kernels are compiled apart for arrays that may be written to.
+    reduced.flags.writeable = False
+    return reduced
 
 
 def seed_pixel(seed: Seed, rig: StereoRig) -> Float64:
