@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -16,6 +17,10 @@ from suturetrack.tracking import Tracker
 from suturetrack.tracking.tracker import FORGOTTEN
 from suturetrack.types import InputError, Seed, Stamp
 
+_LONGEST_WAIT = 10
+"""Fields: where the clocks of two machines disagree, a seed does not wait forever."""
+_ON_ITS_WAY_NS = 5_000_000
+
 
 @dataclass
 class _Case:
@@ -23,6 +28,10 @@ class _Case:
     attempts: int
     request: Request[Seed, SeedReply] | None
     reason: str = "no field came in which to look for the thread"
+    waits: int = 0
+    """Fields for which it waits at most until the segmenter has learned from it."""
+    learned_ns: int = 0
+    """Frames that were released from then on are segmented by what was learned."""
 
 
 class SeedDesk:
@@ -30,9 +39,14 @@ class SeedDesk:
 
     Args:
         patience: fields in which the tracker looks for a thread.
+        at_once: look in the next field, for lock-step, instead of the first one that was segmented with
+            the thread's colour known.
     """
 
-    def __init__(self, bus: Bus, tracker: Tracker, rig: StereoRig, patience: int):
+    def __init__(
+        self, bus: Bus, tracker: Tracker, rig: StereoRig, patience: int, *, at_once: bool = False
+    ):
+        self._at_once = at_once
         self._bus, self._tracker, self._rig, self._patience = bus, tracker, rig, patience
         self._requests = bus.requests(topics.SEED)
         self._forgets = bus.requests(topics.FORGET)
@@ -41,16 +55,20 @@ class SeedDesk:
     @property
     def seeds(self) -> dict[str, Seed]:
         """From where threads are looked for now, by thread; in the calibration's unit."""
-        return {thread: case.seed for thread, case in self._cases.items()}
+        return {thread: case.seed for thread, case in self._cases.items() if not case.waits}
 
     def seed(self, seed: Seed, request: Request[Seed, SeedReply] | None = None) -> None:
         """Has a thread looked for from the next field on; raises InputError outside the image."""
+        self._open(seed, request)
+        self._tracker.seed(seed)
+
+    def _open(self, seed: Seed, request: Request[Seed, SeedReply] | None) -> _Case:
         seed_pixel(seed, self._rig)
         before = self._cases.pop(seed.thread, None)
         if before is not None:
             _answer(before, SeedReply(seed.thread, False, "another seed took its place"))
-        self._cases[seed.thread] = _Case(seed, self._patience, request)
-        self._tracker.seed(seed)
+        case = self._cases[seed.thread] = _Case(seed, self._patience, request)
+        return case
 
     def resume(self, given: Iterable[Seed]) -> None:
         """Takes up the threads of a tracker that died: from their last states, else from their seeds."""
@@ -66,19 +84,30 @@ class SeedDesk:
             else:
                 self._tracker.resume(seed, state)
 
-    def take_requests(self) -> list[Seed]:
-        """Takes the seeds that have come in; those that are looked for from now on, in metres."""
-        taken = []
+    def take_requests(self, stamp: Stamp) -> list[Seed]:
+        """Takes the seeds that have come in; those that are looked for from this field on, in metres."""
         while (request := self._requests.get(0)) is not None:
             seed = scaled(request.question, 1 / self._rig.metres_per_unit)
             try:
-                self.seed(seed, request)
+                case = self._open(seed, request)
             except InputError as error:
                 request.answer(SeedReply(seed.thread, False, str(error)))
             else:
                 self._bus.publish(topics.SEEDING, request.question)
-                taken.append(request.question)
-        return taken
+                case.waits, case.learned_ns = _LONGEST_WAIT, time.time_ns() + _ON_ITS_WAY_NS
+        begun = [self._begin(case, stamp) for case in self._cases.values()]
+        return [seed for seed in begun if seed is not None]
+
+    def _begin(self, case: _Case, stamp: Stamp) -> Seed | None:
+        """The seed, in metres, if its thread is looked for from this field on."""
+        if case.request is None or not case.waits:
+            return None
+        learned = self._at_once or stamp.released_ns >= case.learned_ns
+        case.waits = 0 if learned else case.waits - 1
+        if case.waits:
+            return None
+        self._tracker.seed(case.seed)
+        return case.request.question
 
     def take_forgets(self) -> list[Forget]:
         """Drops the threads that somebody wants to be dropped; those that there were."""
@@ -104,7 +133,7 @@ class SeedDesk:
         """
         for thread, result in results.items():
             case = self._cases.get(thread)
-            if case is None:
+            if case is None or case.waits:
                 continue
             case.attempts -= 1
             if isinstance(result, Initialization):

@@ -39,7 +39,7 @@ def run(service: Service, config: TrackerConfig) -> None:
     bus = service.bus
     rig = service.calibrated_rig()
     tracker = Tracker(rig, config.tracking, config.initialization)
-    desk = SeedDesk(bus, tracker, rig, config.tracking.patience)
+    desk = SeedDesk(bus, tracker, rig, config.tracking.patience, at_once=config.service.lockstep)
     grasps = GraspDesk(bus, rig)
     warm_up(rig, config)
     given = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
@@ -61,7 +61,7 @@ def run(service: Service, config: TrackerConfig) -> None:
             continue
         if gate.began_anew:
             desk.resume(given)
-        for seed in desk.take_requests():
+        for seed in desk.take_requests(ridges.stamp):
             recorder.request(ridges.stamp, seed)
         for forget in desk.take_forgets():
             recorder.request(ridges.stamp, forget)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from dataclasses import dataclass
@@ -188,9 +189,9 @@ def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
     rig.start("tracker", tracker, TrackerConfig(service))
     while not operator.wait_for_alive("segmenter", 0.5):
         assert not rig.errors
+    good = operator.ask(topics.SEED, Seed("right", pixel=seed[0]), 30)
     outside = operator.ask(topics.SEED, Seed("left", pixel=(900.0, 5.0)), 30)
     nothing = operator.ask(topics.SEED, Seed("left", pixel=(5.0, 5.0)), 30)
-    good = operator.ask(topics.SEED, Seed("right", pixel=seed[0]), 30)
     assert good.stamp is not None
     state = next(s for s in states if s.thread == "right" and s.stamp >= good.stamp)
     forgotten = operator.ask(topics.FORGET, Forget("right"), 30)
@@ -204,6 +205,10 @@ def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
     assert not nothing.accepted
     assert nothing.stamp is not None
     assert good.accepted
-    assert good.reason.startswith("found ")
+    # It is looked for in a field that was segmented with the thread's colour known.
+    found = re.match(r"found ([0-9.]+) mm with confidence ([0-9.]+)", good.reason)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(107, abs=2)
+    assert float(found[2]) > 0.8
     assert good.curve is not None
     assert state.status is Status.TRACKING
