@@ -10,6 +10,11 @@ from suturetrack.types import Bool, Float32, Float64
 
 Int64 = NDArray[np.int64]
 
+# A strand claims the ridge so far to its sides; two that are nearer than this make one ridge.
+_CLAIM_PX, _APART_PX = 4.0, 2.0
+# Cosine of the angle up to which two strands may be mistaken for one another.
+_PARALLEL = 0.8
+
 
 @numba.njit(cache=True, nogil=True)
 def response_at(field: Float32, u: float, v: float, tu: float, tv: float) -> float:
@@ -153,6 +158,87 @@ def peaks(profiles: Float64, path: Int64, half: int) -> tuple[Float64, Float64]:
         if bend < 0:
             position[j] = i + min(max(-linear / square / (2 * bend), -1.0), 1.0)
     return position, height
+
+
+@numba.njit(cache=True, nogil=True)
+def claimed(
+    strand: tuple[Float64, Float64, Float64],
+    others: tuple[Float64, Float64, Float64],
+    offsets: Float64,
+    apart: float,
+) -> Bool:
+    """(k, m) places beside a strand that belong to another one: what is predicted nearest has them.
+
+    Args:
+        strand: (k, 2) pixels, (k, 2) unit tangents and (k,) px along the strand of its samples.
+        others: the same of the q samples that may claim places.
+        offsets: (m,) places along the normals (-tv, tu) of the samples.
+        apart: what is nearer than this along the strand is the strand itself.
+    """
+    pixels, tangents, along = strand
+    other_pixels, other_tangents, other_along = others
+    out = np.zeros((len(pixels), len(offsets)), np.bool_)
+    far = np.abs(offsets).max() + _CLAIM_PX
+    for j in range(len(pixels)):
+        tu, tv = tangents[j, 0], tangents[j, 1]
+        for q in range(len(other_pixels)):
+            du, dv = other_pixels[q, 0] - pixels[j, 0], other_pixels[q, 1] - pixels[j, 1]
+            if abs(du) > far or abs(dv) > far or abs(other_along[q] - along[j]) < apart:
+                continue
+            across, ahead = dv * tu - du * tv, du * tu + dv * tv
+            parallel = abs(tu * other_tangents[q, 0] + tv * other_tangents[q, 1])
+            if abs(ahead) > _CLAIM_PX or abs(across) < _APART_PX or parallel < _PARALLEL:
+                continue
+            for i in range(len(offsets)):
+                away = abs(offsets[i] - across)
+                if away < _CLAIM_PX and away < abs(offsets[i]):
+                    out[j, i] = True
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def doubled(
+    strand: tuple[Float64, Float64, Float64],
+    others: tuple[Float64, Float64, Float64],
+    apart: float,
+) -> Bool:
+    """(k,) samples of a strand that lie on another one; the arguments are those of `claimed`."""
+    pixels, tangents, along = strand
+    other_pixels, other_tangents, other_along = others
+    out = np.zeros(len(pixels), np.bool_)
+    for j in range(len(pixels)):
+        for q in range(len(other_pixels)):
+            du, dv = other_pixels[q, 0] - pixels[j, 0], other_pixels[q, 1] - pixels[j, 1]
+            if abs(du) > _CLAIM_PX or abs(dv) > _CLAIM_PX or abs(other_along[q] - along[j]) < apart:
+                continue
+            tu, tv = tangents[j, 0], tangents[j, 1]
+            parallel = abs(tu * other_tangents[q, 0] + tv * other_tangents[q, 1])
+            if abs(dv * tu - du * tv) < _APART_PX and parallel > _PARALLEL:
+                out[j] = True
+                break
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def covered(
+    pixels: Float64, tangents: Float64, offsets: Float64, points: Float64, near: float
+) -> Bool:
+    """(k, m) places along the normals of the samples that are nearer than `near` to a point."""
+    out = np.zeros((len(pixels), len(offsets)), np.bool_)
+    far = np.abs(offsets).max() + near
+    for j in range(len(pixels)):
+        for q in range(len(points)):
+            du, dv = points[q, 0] - pixels[j, 0], points[q, 1] - pixels[j, 1]
+            if abs(du) > far or abs(dv) > far:
+                continue
+            across = dv * tangents[j, 0] - du * tangents[j, 1]
+            ahead = du * tangents[j, 0] + dv * tangents[j, 1]
+            if abs(ahead) >= near:
+                continue
+            for i in range(len(offsets)):
+                if (offsets[i] - across) ** 2 + ahead * ahead < near * near:
+                    out[j, i] = True
+    return out
 
 
 @numba.njit(cache=True, nogil=True)

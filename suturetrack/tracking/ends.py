@@ -127,7 +127,13 @@ class EndWatch:
         self._seen_ns = [now_ns, now_ns]
         self._steady_ns = now_ns
         self.length = self._longest = self._steady = length
+        self.settled = False
+        """Whether the length has been steady for long enough to be the thread's own."""
+        self.wanted = length
+        """Length that the thread would have if every step at its ends were believed."""
         self.seen = (True, True)
+        self.at_border = False
+        """Whether the image's border cuts the thread."""
 
     def moves(
         self, start: EndStep | None, stop: EndStep | None, length: float, now_ns: int
@@ -135,6 +141,7 @@ class EndWatch:
         """How far to move both ends outward, as parts of the curve's `length`."""
         steps = start, stop
         offsets = [step.offset if step else 0.0 for step in steps]
+        self.wanted = length * (1.0 + sum(offsets))
         doubted = self._doubted(steps, offsets, length, now_ns)
         seen = [end not in doubted for end in (0, 1)]
         for end in doubted:
@@ -149,8 +156,9 @@ class EndWatch:
             if seen[end]:
                 self._seen_ns[end] = now_ns
         self.seen = seen[0], seen[1]
+        self.at_border = any(step and step.at_border for step in steps)
         if not doubted:
-            self._remember(length * (1.0 + sum(offsets)), steps, now_ns)
+            self._remember(length * (1.0 + sum(offsets)), now_ns)
         self._last_ns = now_ns
         return offsets[0], offsets[1]
 
@@ -171,20 +179,18 @@ class EndWatch:
         slack = _DRAWN_PX * max(step.pixel for step in shown) * length
         total = length * (1.0 + sum(offsets))
         if total > max(self.length, self._longest) + slack:
-            doubted = [int(np.argmax(offsets))]
-        elif total < self.length - slack:
+            return [int(np.argmax(offsets))]
+        if total < self.length - slack:
             doubted = [end for end in (0, 1) if offsets[end] <= min(offsets) / 2]
         return [end for end in doubted if (now_ns - self._seen_ns[end]) * _NS < _HELD_S]
 
-    def _remember(
-        self, length: float, steps: tuple[EndStep | None, EndStep | None], now_ns: int
-    ) -> None:
+    def _remember(self, length: float, now_ns: int) -> None:
         if abs(length / self._steady - 1) > _STEADY:
             self._steady, self._steady_ns = length, now_ns
         self._steady += 0.02 * (length - self._steady)
-        settled = (now_ns - self._steady_ns) * _NS > _SETTLED_S
-        self.length = self._steady if settled else length
-        if not any(step and step.at_border for step in steps):
+        self.settled = (now_ns - self._steady_ns) * _NS > _SETTLED_S
+        self.length = self._steady if self.settled else length
+        if not self.at_border:
             fading = np.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)
             self._longest = max(length, length + (self._longest - length) * float(fading))
 

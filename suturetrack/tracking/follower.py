@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,16 +15,34 @@ from suturetrack.tracking.control_points import rearrange
 from suturetrack.tracking.ends import EndWatch, doubled_ends, find_end
 from suturetrack.tracking.energies import energies
 from suturetrack.tracking.motion import Motion
-from suturetrack.tracking.reliability import Doubt, Evidence, judge
+from suturetrack.tracking.reliability import (
+    ASTRAY,
+    RELIABILITY_SAMPLES,
+    Doubt,
+    Evidence,
+    judge,
+    loose_ends,
+)
 from suturetrack.tracking.sampling import Samples, distinct, length_of, values_at, views
 from suturetrack.tracking.spacing import respace
-from suturetrack.types import Nurbs, RidgeField, Status, ThreadState
+from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
+from suturetrack.types import Bool, Nurbs, RidgeField, Status, ThreadState
 
 _NS = 1e-9
 # Searches, in units of the first: tried where less than the second is seen, taken if they show more.
 _WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
 _DROP = 0.01
 _RETRY = 5
+# A thread found again has the length that it had, to this part.
+_LENGTH_TOLERANCE = 0.05
+# A thread of which something is hidden has not grown by more.
+_GROWTH = 0.02
+_LEAST_LEFT = 0.65
+_ALL = 0.97
+_SURE_AFTER_S = 0.08
+_SOME = 0.2
+# Places on a thread that keep other threads away.
+_CLAIMS = 160
 
 
 @dataclass
@@ -51,27 +69,42 @@ class Follower:
         levels = measure_levels(curve, field, rig)
         self.last_good = curve
         """The curve when it was last tracked."""
+        self.known_length = length_of(curve)
+        """Length of the thread when it was last tracked and all of it seen, calibration's unit."""
+        self._lost = self._cut = self._established = False
+        self._certain_ns = now
+        self._doubted_ns = -(1 << 62)
         self._doubt = Doubt()
+        self._seen = np.ones(RELIABILITY_SAMPLES, bool)
         self._share = 1.0
         self.model = Model(curve, Motion.none(), levels, now, now, EndWatch(length_of(curve), now))
 
-    @property
-    def known_length(self) -> float:
-        """Length of the thread when all of it was last seen, calibration's unit."""
-        return self.model.ends.length
+    def remember(self, before: Follower) -> None:
+        """Takes over what was known of the thread's length before it was found anew."""
+        self.known_length, self._established = before.known_length, before._established
 
-    def step(self, field: RidgeField, thread: str) -> ThreadState:
-        """The thread in the next field."""
+    def strands(self, capture_ns: int) -> Neighbours:
+        """What is seen of the thread, where it should be at that time: others keep clear of it."""
+        model = self.model
+        curve = model.motion.predict(model.curve, (capture_ns - model.capture_ns) * _NS)
+        s = np.linspace(0, 1, _CLAIMS)
+        both = views(self.rig, values_at(curve, s), values_at(curve, s, 1))
+        seen = np.interp(s, np.linspace(0, 1, len(self._seen)), self._seen) > 0.5
+        return Strand.other(both[0], seen), Strand.other(both[1], seen)
+
+    def step(self, field: RidgeField, thread: str, neighbours: Neighbours = NOBODY) -> ThreadState:
+        """The thread in the next field; `neighbours` are the strands of other threads."""
         model = self.model
         seconds = (field.stamp.capture_ns - model.capture_ns) * _NS
         before = model.curve
         model.capture_ns = field.stamp.capture_ns
         if self.config.method == "paper":
-            evidence, inserted, removed = self._follow_by_forces(field)
+            evidence, inserted, removed = self._follow_by_forces(field, neighbours)
         else:
-            evidence, inserted, removed = self._follow_by_least_squares(field, seconds)
-        seen = evidence.evenly()[1]
-        self._doubt.grow(before, model.curve, seen, self.rig)
+            evidence, inserted, removed = self._follow_by_least_squares(field, seconds, neighbours)
+        seen = self._seen = evidence.evenly()[1]
+        predicted = model.motion.predict(before, seconds)
+        self._doubt.grow(before, predicted, model.curve, seen, self.rig)
         if self.config.method != "paper":
             model.motion = model.motion.learn(
                 before, model.curve, seen, model.ends.seen, self.rig, seconds
@@ -82,30 +115,96 @@ class Follower:
         events = []
         if inserted or removed:
             events.append(f"control points: {inserted} inserted, {removed} removed")
-        astray = evidence.astray(field, self.rig, model.levels)
-        unseen_s = (model.capture_ns - model.seen_ns) * _NS
-        status = judge(evidence, astray, self._doubt.share, unseen_s)
-        if status is Status.TRACKING:
-            self.last_good = model.curve
+        astray, plain = evidence.astray(field, self.rig, model.levels, neighbours)
+        overlong = self._overlong(plain)
+        wrong = astray | (~plain & overlong)
+        status = self._judge(evidence, wrong, plain, overlong)
         return self._state(field, thread, evidence, status, events)
 
-    def _follow_by_forces(self, field: RidgeField) -> tuple[Evidence, int, int]:
+    def _overlong(self, plain: Bool) -> bool:
+        """Whether the thread seems to have grown.
+
+        Where all of it is plain to see and an end seems to go on, the end has met something else;
+        where it is not, the curve makes a detour.
+        """
+        ends = self.model.ends
+        length = length_of(self.model.curve) if plain.mean() > _ALL else ends.wanted
+        self._established |= ends.settled
+        return self._established and length > (1 + _GROWTH) * self.known_length
+
+    def _judge(self, evidence: Evidence, wrong: Bool, plain: Bool, overlong: bool) -> Status:
+        """The status; a curve that was lost must have its length again to be held."""
+        model = self.model
+        if plain.mean() > _ALL and model.ends.settled and self._cut:
+            self._cut = False
+            self.known_length = min(self.known_length, model.ends.length)
+        doubted = wrong | self._doubt.anywhere
+        certain = doubted.mean() <= ASTRAY and not overlong and not self._short
+        if certain and plain.mean() > _ALL and not (self._lost or self._cut):
+            self.known_length = model.ends.length
+        if not certain:
+            self._doubted_ns = model.capture_ns
+        if (model.capture_ns - self._doubted_ns) * _NS > _SURE_AFTER_S:
+            self._certain_ns = model.capture_ns
+        unseen_s = (model.capture_ns - model.seen_ns) * _NS
+        uncertain_s = (model.capture_ns - self._certain_ns) * _NS
+        status = judge(evidence, unseen_s, uncertain_s)
+        length = length_of(model.curve)
+        lengths = self.known_length, length_of(self.last_good)
+        changed = all(abs(length / known - 1) > _LENGTH_TOLERANCE for known in lengths)
+        if self._lost and changed:
+            status = Status.LOST
+        self._lost = status is Status.LOST
+        if status is Status.TRACKING:
+            self.last_good = model.curve
+        elif self._lost and (evidence.share < _SOME or length < _LEAST_LEFT * self.known_length):
+            self._start_again()
+        elif not certain and self.config.method != "paper":
+            self._trim(wrong | self._doubt.hopeless)
+        return status
+
+    @property
+    def _short(self) -> bool:
+        """Whether a part that was cut off has not been found again."""
+        length = length_of(self.model.curve)
+        self._cut &= length < (1 - _LENGTH_TOLERANCE) * self.known_length
+        self._cut &= not self.model.ends.at_border
+        return self._cut
+
+    def _trim(self, wrong: Bool) -> None:
+        """Cuts off what has left the thread at an end, to be found anew."""
+        start, stop = loose_ends(wrong)
+        if 0 < start + stop < len(wrong) / 2:
+            last = len(wrong) - 1
+            self.model.curve = nurbs.part(self.model.curve, start / last, 1 - stop / last)
+            self._cut = self._established
+            self._doubt.cut(start, stop)
+
+    def _start_again(self) -> None:
+        """Looks from where the thread was last held, from the next field on."""
+        model = self.model
+        ends = EndWatch(self.known_length, model.capture_ns)
+        self.model = replace(model, curve=self.last_good, motion=Motion.none(), ends=ends)
+
+    def _follow_by_forces(
+        self, field: RidgeField, neighbours: Neighbours
+    ) -> tuple[Evidence, int, int]:
         model, config = self.model, self.config
         cutoffs = (
             paper.cutoff(field.left, model.levels[0]),
             paper.cutoff(field.right, model.levels[1]),
         )
         curve = paper.fit(model.curve, field, self.rig, cutoffs, config.paper)
-        fit = gauss_newton.observe(curve, field, self.rig, model.levels, config)
+        fit = gauss_newton.observe(curve, field, self.rig, model.levels, config, neighbours)
         model.curve, inserted, removed = respace(curve, self.rig, config.paper.spacing_px)
         return Evidence.of(fit), inserted, removed
 
     def _follow_by_least_squares(
-        self, field: RidgeField, seconds: float
+        self, field: RidgeField, seconds: float, neighbours: Neighbours
     ) -> tuple[Evidence, int, int]:
         model = self.model
         predicted = model.motion.predict(model.curve, seconds)
-        best = self._search(predicted, field)
+        best = self._search(predicted, field, neighbours)
         model.curve = best.fit.curve
         if best.share > 0.3:
             self._adjust_ends(field)
@@ -115,18 +214,21 @@ class Follower:
         model.curve, inserted, removed = rearrange(model.curve, self.rig)
         return best, inserted, removed
 
-    def _search(self, predicted: Nurbs, field: RidgeField) -> Evidence:
+    def _search(self, predicted: Nurbs, field: RidgeField, neighbours: Neighbours) -> Evidence:
         """Looks further away for what was seen before, and now and then for what is hidden."""
         levels, config = self.model.levels, self.config
-        best = Evidence.of(
-            gauss_newton.fit(predicted, field, self.rig, levels, config.search_px, config)
-        )
+
+        def fitted(reach_px: float) -> Evidence:
+            return Evidence.of(
+                gauss_newton.fit(predicted, field, self.rig, levels, reach_px, config, neighbours)
+            )
+
+        best = fitted(config.search_px)
         usual = 1.0 if field.stamp.frame % _RETRY == 0 else self._share - _DROP
         for times, enough, gain in _WIDER:
             if best.share >= min(enough, usual):
                 break
-            reach = times * config.search_px
-            tried = Evidence.of(gauss_newton.fit(predicted, field, self.rig, levels, reach, config))
+            tried = fitted(times * config.search_px)
             if tried.share > best.share + gain:
                 best = tried
         self._share = best.share

@@ -18,6 +18,7 @@ from suturetrack.kernels import search, spline
 from suturetrack.nurbs import curve_from
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.sampling import Samples, View, views
+from suturetrack.tracking.strands import NOBODY, SAME_STRAND_PX, Neighbours, Strand
 from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField
 
 _STEP_PX = 0.5
@@ -69,17 +70,25 @@ def search_normals(
     level: float,
     reach_px: float,
     size: tuple[int, int],
+    neighbours: Strand,
 ) -> Offsets:
-    """Looks for the thread along the normals of the samples, as one continuous line."""
+    """Looks for the thread along the normals of the samples, as one continuous line.
+
+    What lies nearer to another strand of it, or to one of the `neighbours`, is theirs.
+    """
     half = round(reach_px / _STEP_PX)
     grid = _STEP_PX * np.arange(-half, half + 1)
     leniency = _LENIENCY if reach_px > _REFINED_PX else 0.0
     profiles = search.normal_profiles(image, view.pixels, view.tangents, grid, leniency)
-    gain = np.minimum(profiles / level, 1.0) - 0.1 * (grid / reach_px) ** 2
+    strand = Strand.of(view, share)
+    taken = search.claimed(strand.arrays, strand.joined(neighbours).arrays, grid, SAME_STRAND_PX)
+    gain = np.where(taken, 0.0, np.minimum(profiles / level, 1.0)) - 0.1 * (grid / reach_px) ** 2
     path = search.best_path(gain, _ROUGHNESS * _STEP_PX**2, 4)
     position, response = search.peaks(profiles, path, round(_PEAK_HALF_PX / _STEP_PX))
     offset = (position - half) * _STEP_PX
     found = np.isfinite(position) & (response > _LEAST_RESPONSE * level) & view.inside(size)
+    nearest = np.where(found, np.round(position), 0).astype(int)
+    found &= ~taken[np.arange(len(taken)), nearest]
     found = search.solid(found, view.speed * share, _SHORTEST_RUN_PX)
     return Offsets(np.where(found, offset, 0.0), response, found)
 
@@ -91,6 +100,7 @@ def fit(
     levels: tuple[float, float],
     reach_px: float,
     config: TrackingConfig,
+    neighbours: Neighbours = NOBODY,
 ) -> Fit:
     """Moves the predicted curve onto the field.
 
@@ -98,6 +108,7 @@ def fit(
         predicted: cubic, parametrised like its arc length.
         levels: response of a clear view of the thread, left and right.
         reach_px: how far along the normals the thread is looked for at first.
+        neighbours: other threads, left and right.
     """
     samples = Samples.of(predicted.knots, config.samples_per_span)
     reference = _Reference.of(samples, predicted)
@@ -105,7 +116,7 @@ def fit(
     reach, outlier = reach_px, math.inf
     rounds = config.iterations + round(math.log2(max(reach_px / config.search_px, 1.0)))
     for _ in range(rounds):
-        linear = _Linearized(samples, control_points, field, rig, levels, reach)
+        linear = _Linearized(samples, control_points, field, rig, levels, reach, neighbours)
         equations = linear.equations(reference, levels, config, outlier)
         control_points = control_points + equations.solve()
         outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
@@ -121,10 +132,11 @@ def observe(
     rig: StereoRig,
     levels: tuple[float, float],
     config: TrackingConfig,
+    neighbours: Neighbours = NOBODY,
 ) -> Fit:
     """What the field says about a curve that something else has fitted."""
     samples = Samples.of(curve.knots, config.samples_per_span)
-    linear = _Linearized(samples, curve.control_points, field, rig, levels, _REFINED_PX)
+    linear = _Linearized(samples, curve.control_points, field, rig, levels, _REFINED_PX, neighbours)
     equations = linear.equations(_Reference.of(samples, curve), levels, config, _OUTLIER_PX)
     equations.solve()
     residual = _residual([view.pixels for view in linear.views], linear)
@@ -159,6 +171,7 @@ class _Linearized:
         rig: StereoRig,
         levels: tuple[float, float],
         reach_px: float,
+        neighbours: Neighbours,
     ) -> None:
         self.samples = samples
         self.points, self.first, self.second = (
@@ -166,9 +179,9 @@ class _Linearized:
         )
         self.views = views(rig, self.points, self.first)
         left, right = (
-            search_normals(image, view, samples.share, level, reach_px, rig.image_size)
-            for image, view, level in zip(
-                (field.left, field.right), self.views, levels, strict=True
+            search_normals(image, view, samples.share, level, reach_px, rig.image_size, others)
+            for image, view, level, others in zip(
+                (field.left, field.right), self.views, levels, neighbours, strict=True
             )
         )
         self.offsets = left, right

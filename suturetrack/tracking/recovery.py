@@ -9,11 +9,14 @@ from suturetrack.initialization import InitializationConfig, InitializationError
 from suturetrack.kernels import search
 from suturetrack.nurbs import evaluate, length, reversed_curve, tangents
 from suturetrack.tracking.sampling import views
+from suturetrack.tracking.strands import Neighbours, Strand
 from suturetrack.types import Float64, Nurbs, RidgeField, Seed
 
 _PLACES = 24
 _SEEDS = 2
-_LENGTH_TOLERANCE = 0.1
+_LENGTH_TOLERANCE = 0.05
+# Threads that lie on one another do so for less of their length.
+_SHARED = 0.3
 
 
 def find_again(
@@ -36,6 +39,18 @@ def find_again(
         if abs(length(curve) / known_length - 1) < _LENGTH_TOLERANCE:
             return directed(curve, last)
     return None
+
+
+def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
+    """Whether much of the curve lies on the strands of other threads, in both images."""
+    s: Float64 = np.linspace(0, 1, 4 * _PLACES)
+    alone = np.zeros(len(s), bool)
+    for view, strand in zip(
+        views(rig, evaluate(curve, s), tangents(curve, s)), others, strict=True
+    ):
+        own = Strand(view.pixels, view.tangents, np.zeros(len(s)))
+        alone |= ~search.doubled(own.arrays, strand.arrays, 0.0)
+    return bool(np.mean(~alone) > _SHARED)
 
 
 def _seeds_on(last: Nurbs, thread: str, field: RidgeField, rig: StereoRig) -> list[Seed]:

@@ -9,21 +9,25 @@ import numpy as np
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.tracking.gauss_newton import Fit
-from suturetrack.tracking.sampling import Samples, values_at, views
-from suturetrack.types import Bool, Float64, Nurbs, RidgeField, Status
+from suturetrack.tracking.sampling import View, values_at, views
+from suturetrack.tracking.strands import SAME_STRAND_PX, Neighbours, Strand
+from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField, Status
 
 RELIABILITY_SAMPLES = 64
 _NEAR_PX = 1.5
-_BESIDE_PX = np.arange(-30.0, 30.1, 1.5)
+_BESIDE_PX, _NOT_OWN_PX = np.arange(-30.0, 30.1, 1.5), 6.0
+_NEXT_PX, _NOT_TAKEN_PX = np.arange(-10.0, 10.1, 1.0), 3.0
 _CLEAR = 0.5
 # Shares of the curve's length.
 _MOST = 0.5
 _SOME = 0.2
-_ASTRAY = 0.05
+ASTRAY = 0.05
 _LOST_AFTER_S = 0.2
 _DRIFT = 0.35
 _DRIFT_AT_REST_PX = 0.2
-_ANYWHERE_PX = 8.0
+_ANYWHERE_PX, _HOPELESS_PX = 5.0, 15.0
+_GAP = 5
+_BORDER_PX = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,27 +53,57 @@ class Evidence:
         """Standard deviation, and whether seen, at evenly spaced parameters."""
         s, at = self.fit.samples.s, np.linspace(0, 1, RELIABILITY_SAMPLES)
         sigma = np.sqrt(np.trace(self.fit.covariance, axis1=1, axis2=2))
-        nearest = np.clip(np.searchsorted(s, at), 0, len(s) - 1)
-        return np.interp(at, s, sigma), self.seen[nearest]
+        return np.interp(at, s, sigma), self._even(self.seen)
 
-    def astray(self, field: RidgeField, rig: StereoRig, levels: tuple[float, float]) -> float:
-        """Share of the curve that is unseen although both images show a thread beside it."""
-        unseen = np.flatnonzero(~self.seen)
-        if not len(unseen):
-            return 0.0
-        curve, samples = self.fit.curve, self.fit.samples
-        places = Samples.at(curve.knots, samples.s)
-        both = views(
-            rig, places.values(curve.control_points), places.values(curve.control_points, 1)
-        )
-        beside = np.ones(len(unseen), bool)
-        for image, view, level in zip((field.left, field.right), both, levels, strict=True):
-            profiles = search.normal_profiles(
-                image, view.pixels[unseen], view.tangents[unseen], _BESIDE_PX
-            )
-            own = _own(view.pixels[unseen], view.normals[unseen], view.pixels[self.seen])
-            beside &= (np.where(own, 0.0, profiles) > _CLEAR * level).any(axis=1)
-        return float(np.sum(samples.share[unseen] * beside))
+    def astray(
+        self,
+        field: RidgeField,
+        rig: StereoRig,
+        levels: tuple[float, float],
+        neighbours: Neighbours,
+    ) -> tuple[Bool, Bool]:
+        """(k,) whether the curve has left the thread, and whether it is plainly on it.
+
+        It has left where both images show a thread beside a stretch that is unseen; and where it lies
+        on another strand in an image, with a strand beside it that is nobody's. It is plainly on the
+        thread where it is seen and lies on no other strand.
+        """
+        samples, points = self.fit.samples, self.fit.curve.control_points
+        both = views(rig, samples.values(points), samples.values(points, 1))
+        unseen, left_alone, plain = ~self.seen, np.zeros(len(self.seen), bool), self.seen.copy()
+        for image, view, level, others in zip(
+            (field.left, field.right), both, levels, neighbours, strict=True
+        ):
+            own = Strand.of(view, samples.share)
+            all_seen = own.where(self.seen).joined(others)
+            double = self.seen & search.doubled(own.arrays, all_seen.arrays, SAME_STRAND_PX)
+            unseen &= _beside(image, view, unseen, all_seen, _BESIDE_PX, _NOT_OWN_PX, level)
+            left_alone |= _beside(image, view, double, all_seen, _NEXT_PX, _NOT_TAKEN_PX, level)
+            plain &= ~double
+        return self._even(unseen | left_alone), self._even(plain)
+
+    def _even(self, flags: Bool) -> Bool:
+        s, at = self.fit.samples.s, np.linspace(0, 1, RELIABILITY_SAMPLES)
+        return flags[np.clip(np.searchsorted(s, at), 0, len(s) - 1)]
+
+
+def _beside(
+    image: Float32,
+    view: View,
+    which: Bool,
+    strands: Strand,
+    offsets: Float64,
+    near: float,
+    level: float,
+) -> Bool:
+    """(k,) those of `which` samples beside which runs a thread that is further from all strands."""
+    out = np.zeros(len(which), bool)
+    if which.any():
+        pixels, tangents = view.pixels[which], view.tangents[which]
+        profiles = search.normal_profiles(image, pixels, tangents, offsets)
+        taken = search.covered(pixels, tangents, offsets, strands.pixels, near)
+        out[which] = (np.where(taken, 0.0, profiles) > _CLEAR * level).any(axis=1)
+    return out
 
 
 class Doubt:
@@ -82,41 +116,64 @@ class Doubt:
     def __init__(self) -> None:
         self.px: Float64 = np.zeros(RELIABILITY_SAMPLES)
 
-    def grow(self, before: Nurbs, after: Nurbs, seen: Bool, rig: StereoRig) -> None:
+    def grow(
+        self, before: Nurbs, predicted: Nurbs, after: Nurbs, seen: Bool, rig: StereoRig
+    ) -> None:
         """One field later, in which the curve moved from `before` to `after`."""
         s = np.linspace(0, 1, RELIABILITY_SAMPLES)
-        moved = rig.project(values_at(after, s))[0] - rig.project(values_at(before, s))[0]
-        drift = _DRIFT * np.linalg.norm(moved, axis=1) + _DRIFT_AT_REST_PX
-        self.px = np.where(seen, 0.0, np.hypot(self.px, drift))
+        curves = before, predicted, after
+        places = [rig.project(values_at(curve, s))[0] for curve in curves]
+        both = views(rig, values_at(after, s), values_at(after, s, 1))
+        outside = ~np.all([view.inside(rig.image_size, _BORDER_PX) for view in both], axis=0)
+        moved = np.linalg.norm(places[2] - places[0], axis=1)
+        surprise = np.linalg.norm(places[2] - places[1], axis=1)
+        if seen.any():
+            surprise = np.interp(s, s[seen], surprise[seen])
+        drift = _DRIFT * moved + surprise + _DRIFT_AT_REST_PX
+        self.px = np.where(seen | outside, 0.0, np.hypot(self.px, drift))
+
+    def cut(self, start: int, stop: int) -> None:
+        """So many samples were cut off at the ends."""
+        kept = self.px[start : len(self.px) - stop]
+        places = np.linspace(0, len(kept) - 1, len(self.px))
+        self.px = np.interp(places, np.arange(len(kept)), kept)
 
     @property
-    def share(self) -> float:
-        """Share of the curve that may be anywhere."""
-        return float(np.mean(self.px > _ANYWHERE_PX))
+    def anywhere(self) -> Bool:
+        """(k,) what may be anywhere."""
+        return self.px > _ANYWHERE_PX
+
+    @property
+    def hopeless(self) -> Bool:
+        """(k,) what is surely elsewhere."""
+        return self.px > _HOPELESS_PX
 
 
-def judge(evidence: Evidence, astray: float, doubted: float, unseen_s: float) -> Status:
+def loose_ends(wrong: Bool) -> tuple[int, int]:
+    """How many of the evenly spaced samples at the start and at the stop are wrong, gaps included."""
+    counts = []
+    for flags in (wrong, wrong[::-1]):
+        last = -1
+        for j in np.flatnonzero(flags):
+            if j - last > _GAP:
+                break
+            last = int(j)
+        counts.append(last + 1)
+    return counts[0], counts[1]
+
+
+def judge(evidence: Evidence, unseen_s: float, uncertain_s: float) -> Status:
     """The status of a curve.
 
     Args:
         evidence: what the field says about it.
-        astray: share of it beside which a thread runs.
-        doubted: share of it that may be anywhere.
         unseen_s: time since half of it was last seen.
+        uncertain_s: time since when more than a little of it may be anywhere or has another length.
     """
-    if astray > _ASTRAY or doubted > _ASTRAY:
+    if uncertain_s > _LOST_AFTER_S:
         return Status.LOST
-    if evidence.share >= _MOST:
+    if evidence.share >= _MOST and uncertain_s == 0:
         return Status.TRACKING
     if evidence.share >= _SOME or unseen_s < _LOST_AFTER_S:
         return Status.OCCLUDED
     return Status.LOST
-
-
-def _own(pixels: Float64, normals: Float64, seen: Float64) -> Bool:
-    """(k, m) where the normals' offsets meet the seen part of the curve itself."""
-    places = pixels[:, None, :] + _BESIDE_PX[None, :, None] * normals[:, None, :]
-    if not len(seen):
-        return np.zeros(places.shape[:2], bool)
-    away = np.linalg.norm(places[:, :, None, :] - seen[None, None, ::2, :], axis=-1)
-    return away.min(axis=-1) < 6.0

@@ -16,8 +16,9 @@ from suturetrack.initialization import (
 from suturetrack.tracking.clock import StreamClock
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
-from suturetrack.tracking.recovery import directed, find_again
+from suturetrack.tracking.recovery import directed, find_again, lies_on
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
+from suturetrack.tracking.strands import NOBODY, Neighbours
 from suturetrack.types import Energies, Nurbs, RidgeField, Seed, Stamp, Status, ThreadState
 
 FORGOTTEN = "forgotten"
@@ -121,7 +122,7 @@ class Tracker:
     def _follow(
         self, name: str, thread: _Thread, follower: Follower, field: RidgeField
     ) -> ThreadState:
-        state = follower.step(field, name)
+        state = follower.step(field, name, self._others(name, field))
         was_lost = thread.last is not None and thread.last.status is Status.LOST
         if state.status is not Status.LOST:
             thread.wait_ns = 0
@@ -145,11 +146,28 @@ class Tracker:
             return None
         thread.wait_ns = field.stamp.capture_ns + _BETWEEN_ATTEMPTS_NS
         curve = find_again(last, known_length, thread.seed, field, self._rig, self._initialization)
-        if curve is None:
+        others = self._others(name, field)
+        if curve is None or lies_on(curve, others, self._rig):
             return None
-        thread.follower = Follower(curve, field, self._rig, self._config)
-        state = thread.follower.step(field, name)
+        follower = Follower(curve, field, self._rig, self._config)
+        if thread.follower is not None:
+            follower.remember(thread.follower)
+        state = follower.step(field, name, others)
+        if state.status is not Status.TRACKING:
+            return None
+        thread.follower = follower
         return replace(state, events=("found again", *state.events))
+
+    def _others(self, name: str, field: RidgeField) -> Neighbours:
+        """The strands of the threads that are held, but for one."""
+        left, right = NOBODY
+        for other, thread in self._threads.items():
+            if other == name or thread.follower is None or thread.last is None:
+                continue
+            if thread.last.status is not Status.LOST:
+                strands = thread.follower.strands(field.stamp.capture_ns)
+                left, right = left.joined(strands[0]), right.joined(strands[1])
+        return left, right
 
     def _find(
         self,
@@ -170,7 +188,7 @@ class Tracker:
             found = replace(found, curve=directed(found.curve, thread.toward))
         initializations[name] = found
         thread.follower = Follower(found.curve, field, self._rig, self._config)
-        state = thread.follower.step(field, name)
+        state = thread.follower.step(field, name, self._others(name, field))
         return replace(state, events=("found", *state.events))
 
 
