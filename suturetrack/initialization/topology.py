@@ -242,7 +242,9 @@ def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
     over ridge, at one strength."""
     arms = [a for s in ridges.segments for a in (_arm(s), _arm(s[::-1]))]
     positions = np.array([a[0] for a in arms])
-    strengths = np.array([ridges.sample(a).mean() for a in arms])
+    near = np.array([ridges.sample(a).mean() for a in arms])
+    # A highlight at a junction fades one arm of a segment, and not the segment.
+    whole = np.repeat([np.median(ridges.sample(s)) for s in ridges.segments], 2)
     pairs = cKDTree(positions).query_pairs(2 * config.gap_px, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
     cost, touching = np.empty(len(pairs)), np.zeros(len(pairs), bool)
@@ -251,7 +253,7 @@ def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
         distance = float(np.linalg.norm(positions[j] - positions[i]))
         seen, weakest = _evidence(ridges, bridge, config)
         missing = (1 - seen) * distance / config.gap_px
-        ratio = float(np.log(strengths[i] / strengths[j]))
+        ratio = min(abs(float(np.log(s[i] / s[j]))) for s in (near, whole))
         cost[k] = (
             misfit + _SWING * swing**2 + missing + 0.1 * distance / config.gap_px + 0.25 * ratio**2
         )
