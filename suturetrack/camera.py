@@ -137,6 +137,16 @@ class StereoRig:
         size = -(-width // scale), -(-height // scale)
         return StereoRig(size, left, right, self.metres_per_unit)
 
+    def with_row_offset(self, rows: float) -> StereoRig:
+        """The rig whose right view shows everything `rows` px lower than this one's."""
+        if not rows:
+            return self
+        lower = np.array([[1.0, 0, 0], [0, 1, rows], [0, 0, 1]])
+        right = replace(
+            self.right, matrix=lower @ self.right.matrix, projection=lower @ self.right.projection
+        )
+        return replace(self, right=right)
+
     @cached_property
     def is_rectified(self) -> bool:
         """Whether raw pixels are rectified pixels."""

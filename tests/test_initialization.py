@@ -13,6 +13,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
 from suturetrack.metrics import curve_error, polyline_distances
 from suturetrack.segmentation import Segmenter
+from suturetrack.stage import Picture, open_scene
 from suturetrack.types import (
     Float64,
     Image,
@@ -249,3 +250,27 @@ def test_the_unit_does_not_matter(rig: StereoRig, curve: Nurbs, baseline: float)
         there.curve.control_points / scale, here.curve.control_points, rtol=1e-6, atol=1e-6
     )
     assert there.confidence == pytest.approx(here.confidence)
+
+
+@pytest.mark.parametrize("rows", [-2, 1])
+def test_rows_off_the_calibration_are_noticed_and_do_not_spoil_the_curve(rows: int) -> None:
+    scene = open_scene("figure8-175", 3, picture=Picture("black", "plain"))
+    left, right = scene.render(0)
+    moved = np.roll(right, rows, axis=0)
+    seed = Seed(pixel=scene.seed_pixel(0))
+    segmenter = Segmenter(scene.rig)
+    lengths = {}
+    for name, view in (("right", right), ("moved", moved)):
+        frame = StereoFrame(Stamp(0, 0, 0), left, view)
+        segmenter.learn(frame, seed)
+        found = initialize(segmenter.step(frame), scene.rig, seed)
+        lengths[name] = nurbs.length(found.curve)
+        if name == "moved":
+            way = "lower" if rows > 0 else "higher"
+            assert found.reasons[0].startswith(f"the right view lies {abs(rows)} px {way}")
+    assert lengths["moved"] == pytest.approx(lengths["right"], rel=0.13)
+    lowered = scene.rig.with_row_offset(rows)
+    point = scene.truth(0)[0].points[:1]
+    assert lowered.project(point)[1] - scene.rig.project(point)[1] == pytest.approx(
+        np.array([[0.0, rows]])
+    )

@@ -10,9 +10,9 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization.confidence import judge
 from suturetrack.initialization.ends import move_end, read_end
 from suturetrack.initialization.fitting import fit_marks, image_parameters, refine
-from suturetrack.initialization.growth import grow_thread, nearest_segment
+from suturetrack.initialization.growth import follow_thread, grow_thread, nearest_segment
 from suturetrack.initialization.hypotheses import Hypothesis, find_thread
-from suturetrack.initialization.matching import Match, match
+from suturetrack.initialization.matching import Match, match, raised, row_offset
 from suturetrack.initialization.model import (
     Growth,
     Initialization,
@@ -21,6 +21,7 @@ from suturetrack.initialization.model import (
     ViewGrowth,
 )
 from suturetrack.initialization.segments import Ridges, find_ridges, thread_scale
+from suturetrack.nurbs import length
 from suturetrack.types import Float32, Float64, InputError, RidgeField, Seed
 
 __all__ = [
@@ -34,6 +35,8 @@ __all__ = [
 
 
 _SHORTEST_STEPS = 4
+_SPOILT = 0.12
+"""How far the lengths of two curves are apart, as a logarithm, if the rows of one spoil it."""
 _LEAST_MATCH = 0.35
 """Median response of the right view, against the left one, below which it shows another scene."""
 
@@ -79,12 +82,44 @@ def _initialize(
     scale: int,
 ) -> Initialization:
     """As `initialize`, in a field reduced by `scale`; only texts have pixels of the whole image."""
-    ridges = left, find_ridges(field.right, config)
-    origin, candidates = nearest_segment(ridges[0], pixel, config.snap_px)
+    origin, candidates = nearest_segment(left, pixel, config.snap_px)
     if origin is None:
         reason = _nothing_there(scale * candidates, scale * pixel, config)
         raise InitializationError(reason, candidates)
     nearest = float(rig.left.projection[0, 2] - rig.right.projection[0, 2])
+    chain = follow_thread(left, origin, config).chain
+    rows = row_offset(chain, field.left, field.right, nearest)
+    found: Initialization | None = None
+    try:
+        found = _reconstruct(field, left, rig, origin, pixel, config, scale)
+    except InitializationError:
+        if not rows:
+            raise
+    if found is not None and not rows:
+        return found
+    moved = RidgeField(field.stamp, field.left, raised(field.right, rows))
+    other = _reconstruct(moved, left, rig, origin, pixel, config, scale)
+    # The calibration stands unless its rows spoil the curve.
+    if found is None or abs(np.log(length(found.curve) / length(other.curve))) > _SPOILT:
+        found = replace(other, row_offset_px=scale * rows)
+    way = "lower" if rows > 0 else "higher"
+    said = f"the right view lies {abs(scale * rows)} px {way} than the calibration says"
+    return replace(found, reasons=(said, *found.reasons))
+
+
+def _reconstruct(
+    field: RidgeField,
+    left: Ridges,
+    rig: StereoRig,
+    origin: int,
+    pixel: Float64,
+    config: InitializationConfig,
+    scale: int,
+) -> Initialization:
+    """The thread through segment `origin` of the left view."""
+    nearest = float(rig.left.projection[0, 2] - rig.right.projection[0, 2])
+    candidates = nearest_segment(left, pixel, config.snap_px)[1]
+    ridges = left, find_ridges(field.right, config)
     found = find_thread(field, ridges, origin, pixel, nearest, config)
     pixels = found.pixels
     step = max(1, round(config.step_px))
@@ -100,7 +135,12 @@ def _initialize(
     s = image_parameters(pixels[:, :2], pixels[:, 2:])
     points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
     curve = fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
-    curve, samples, sigma = refine(curve, (field.left, field.right), rig)
+    try:
+        curve, samples, sigma = refine(curve, (field.left, field.right), rig)
+    except FloatingPointError as error:
+        raise InitializationError(
+            f"no curve fits both views: {error}", candidates, growth
+        ) from None
     confidence, reasons = judge(curve, samples, sigma, found.chains, rig, scale)
     return Initialization(curve, confidence, reasons, samples.distance_px, growth)
 

@@ -55,6 +55,10 @@ def fit_marks(points: Float64, s: Float64, spans: int) -> Nurbs:
     return _closest(knots, s, points, np.tile(np.eye(3), (len(s), 1, 1)))
 
 
+_FARTHEST_PX = 1e5
+"""Length in the images beyond which a curve has come apart."""
+
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """Places on a curve, evenly spaced in the images, and what the images say there."""
@@ -76,13 +80,19 @@ class Samples:
 
     @classmethod
     def of(cls, curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig) -> Samples:
-        """Samples `curve` and looks for the crests beside it."""
+        """Samples `curve` and looks for the crests beside it.
+
+        Raises:
+            FloatingPointError: the curve has left the finite world.
+        """
         fine = np.linspace(0, 1, 16 * len(curve.control_points))
         steps = [
             np.linalg.norm(np.diff(p, axis=0), axis=1)
             for p in rig.project(nurbs.evaluate(curve, fine))
         ]
         travelled = np.r_[0, np.cumsum((steps[0] + steps[1]) / 2)]
+        if not travelled[-1] < _FARTHEST_PX:
+            raise FloatingPointError("it runs out of both images")
         count = max(int(travelled[-1] / SPACING_PX), 2 * len(curve.control_points))
         s = np.interp(np.linspace(0, travelled[-1], count), travelled, fine)
         points = nurbs.evaluate(curve, s)

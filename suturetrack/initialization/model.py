@@ -77,6 +77,8 @@ class Initialization:
     reprojection_px: float
     """Mean distance of the projected curve from the crest of the ridge, both views, px."""
     growth: Growth
+    row_offset_px: int = 0
+    """How much lower than the calibration says the right view lies; 0 where the curve bears it."""
 
 
 class InitializationError(Exception):

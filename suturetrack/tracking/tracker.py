@@ -47,6 +47,8 @@ class _Thread:
     """Curve of the thread that had the name before."""
     wait_ns: int = 0
     """Until when the lost thread is not looked for again."""
+    rows: int = 0
+    """How much lower than the calibration says the right view shows the thread, px."""
 
 
 class Tracker:
@@ -149,7 +151,7 @@ class Tracker:
         others = self._others(name, field)
         if curve is None or lies_on(curve, others, self._rig):
             return None
-        follower = Follower(curve, field, self._rig, self._config)
+        follower = self._follower(thread, curve, field)
         if thread.follower is not None:
             follower.remember(thread.follower)
         state = follower.step(field, name, others)
@@ -157,6 +159,9 @@ class Tracker:
             return None
         thread.follower = follower
         return replace(state, events=("found again", *state.events))
+
+    def _follower(self, thread: _Thread, curve: Nurbs, field: RidgeField) -> Follower:
+        return Follower(curve, field, self._rig.with_row_offset(thread.rows), self._config)
 
     def _others(self, name: str, field: RidgeField) -> Neighbours:
         """The strands of the threads that are held, but for one."""
@@ -187,7 +192,8 @@ class Tracker:
         if thread.toward is not None:
             found = replace(found, curve=directed(found.curve, thread.toward))
         initializations[name] = found
-        thread.follower = Follower(found.curve, field, self._rig, self._config)
+        thread.rows = found.row_offset_px
+        thread.follower = self._follower(thread, found.curve, field)
         state = thread.follower.step(field, name, self._others(name, field))
         return replace(state, events=("found", *state.events))
 
