@@ -72,7 +72,7 @@ ROLES = {
         Role(
             "segmenter",
             "turns frames into fields",
-            reads=(topics.FRAME, topics.SEEDING, topics.STATE),
+            reads=(topics.FRAME, topics.SEEDING, topics.DROPPED, topics.STATE),
             asks=(topics.CALIBRATION,),
             recalls=(topics.SEEDING,),
             processes=("segmenter",),

@@ -263,10 +263,12 @@ class _Worker:
     def _give(self, request: Request) -> None:
         # A question has arrived when this returns; what comes of it is in the new recording.
         with suppress(NoAnswer):
-            if isinstance(request, Forget):
+            if self._part is _SEGMENTER:
+                self.publish(
+                    topics.DROPPED if isinstance(request, Forget) else topics.SEEDING, request
+                )
+            elif isinstance(request, Forget):
                 self._bus.ask(topics.FORGET, request, timeout=0)
-            elif self._part is _SEGMENTER:
-                self.publish(topics.SEEDING, request)
             else:
                 self._bus.ask(topics.SEED, request, timeout=0)
 

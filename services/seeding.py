@@ -118,6 +118,7 @@ class SeedDesk:
             if case is not None:
                 _answer(case, SeedReply(thread, False, "the thread was dropped"))
             known = self._tracker.forget(thread)
+            self._bus.publish(topics.DROPPED, request.question)
             request.answer(Forgotten(thread, known))
             if known:
                 taken.append(request.question)
@@ -144,6 +145,7 @@ class SeedDesk:
                     continue
                 if case.request is None:
                     raise InputError(_failure(case))
+                self._bus.publish(topics.DROPPED, Forget(thread))
                 _answer(case, self._not_found(thread, stamp, result))
             del self._cases[thread]
 

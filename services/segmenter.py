@@ -50,7 +50,7 @@ def run(service: Service, config: SegmenterConfig) -> None:
     segmenter.warm_up()
     bus.make_room(warm_up(rig, config))
     recorder = service.record(rig, config)
-    seedings = bus.every(topics.SEEDING)
+    seedings, drops = bus.every(topics.SEEDING), bus.every(topics.DROPPED)
     states = bus.every(topics.STATE)
     adaptation = Adaptation(segmenter, rig, states, lockstep=config.service.lockstep)
     given = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
@@ -68,6 +68,9 @@ def run(service: Service, config: SegmenterConfig) -> None:
                 segmenter.learn(frame, given.pop(0))
             for place in held.seeds(frame.stamp) if held is not None else ():
                 segmenter.learn(frame, place)
+            while (drop := drops.get(0)) is not None:
+                segmenter.forget(drop.thread)
+                recorder.request(frame.stamp, drop)
             while (seed := seedings.get(0)) is not None:
                 segmenter.learn(frame, scaled(seed, 1 / rig.metres_per_unit))
                 recorder.request(frame.stamp, seed)

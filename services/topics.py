@@ -69,11 +69,25 @@ SEEDING = Topic(
     "the seed from which a thread is looked for",
     "source",
 )
+DROPPED = Topic(
+    "thread/{thread}/dropped", Forget, "tracker", "every", "what was learned at its seed is void"
+)
 STEP = Topic("step", Stamp, "tracker", "every", "the tracker is done with this frame", "segmenter")
 HEALTH = Topic("health/{process}", Health, "*", "every", "heartbeat, once a second")
 TOOL = Topic("tool/{tool}/pose", ToolPose, "client", "every", "where a tool is, and its trigger")
 SNAP = Topic("tool/{tool}/snap", ToolSnap, "tooltip", "every", "the thread at the tip of a tool")
-TOPICS: tuple[Topic[Any], ...] = (FRAME, FIELD, STATE, TRUTH, SEEDING, STEP, TOOL, SNAP, HEALTH)
+TOPICS: tuple[Topic[Any], ...] = (
+    FRAME,
+    FIELD,
+    STATE,
+    TRUTH,
+    SEEDING,
+    DROPPED,
+    STEP,
+    TOOL,
+    SNAP,
+    HEALTH,
+)
 
 CALIBRATION: Question[None, StereoRig] = Question(
     "calibration", type(None), StereoRig, "source", "the rig behind the frames"

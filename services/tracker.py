@@ -69,7 +69,6 @@ def run(service: Service, config: TrackerConfig) -> None:
         for state in step.states:
             bus.publish(topics.STATE, scaled(state, rig.metres_per_unit))
         grasps.update(step.states)
-        bus.publish(topics.STEP, ridges.stamp)
         published_ns = service.finished(ridges.stamp)
         recorder.initializations(ridges, desk.seeds, step.initializations)
         if step.states:
@@ -77,6 +76,8 @@ def run(service: Service, config: TrackerConfig) -> None:
         else:
             recorder.passed(ridges.stamp, published_ns)
         desk.settle(ridges.stamp, step.initializations)
+        # The last word: in lock-step, all that was said of this frame is there before the next one.
+        bus.publish(topics.STEP, ridges.stamp)
     desk.close()
 
 

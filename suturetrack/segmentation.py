@@ -69,6 +69,8 @@ class SegmentationConfig:
     polarity: Polarity = "auto"
     """Whether the thread is darker or brighter than its surroundings. `auto`: dark until a seed
     shows otherwise."""
+    adapt: bool = True
+    """Whether what was learned of a thread follows, once a second, how it looks along its curve."""
 
     def __post_init__(self) -> None:
         if not all(sigma > 0 for sigma in (self.beta, self.blur, *(self.sigmas or (1.0,)))):
@@ -134,13 +136,19 @@ class Segmenter:
             self._threads[seed.thread] = contrast
             self._relook()
 
+    def forget(self, thread: str) -> None:
+        """Look for a thread no more; without any, look as before the first was learned."""
+        if self._threads.pop(thread, None) is not None:
+            self._relook()
+
     def adapt(self, frame: StereoFrame, pixels: Float64, thread: str = "0") -> None:
         """Follow slow changes of the light: go a part of the way to what a held curve shows.
 
         Args:
             frame: the frame that the curve belongs to.
             pixels: (N, 2) raw left pixels along the curve, where the thread is seen.
-            thread: which thread this is; one that was never learned is left alone.
+            thread: which thread this is; one that was never learned is left alone, and every one
+            where the configuration says so.
 
         Raises:
             InputError: as `step`.
@@ -148,7 +156,8 @@ class Segmenter:
         self._check(frame)
         width, height = self._rig.image_size
         inside = (pixels >= 0).all(1) & (pixels <= (width - 1, height - 1)).all(1)
-        if thread not in self._threads or np.count_nonzero(inside) < _FEWEST_PIXELS:
+        learned = self._config.adapt and thread in self._threads
+        if not learned or np.count_nonzero(inside) < _FEWEST_PIXELS:
             return
         old = self._threads[thread]
         seen = contrast_along(frame.left, pixels[inside], old.sigma)
@@ -189,7 +198,8 @@ class Segmenter:
         return float(u), float(v)
 
     def _relook(self) -> None:
-        self._look = _learned_look(self._config, list(self._threads.values()))
+        threads = list(self._threads.values())
+        self._look = _learned_look(self._config, threads) if threads else _first_look(self._config)
 
 
 @dataclass(frozen=True, eq=False)

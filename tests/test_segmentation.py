@@ -388,6 +388,38 @@ def test_a_seed_on_nothing_teaches_nothing(scene: Scene) -> None:
     assert sum(contrast_at(image, pixel) is not None for pixel in nothing) <= len(nothing) // 20
 
 
+def test_what_was_learned_at_a_seed_can_be_forgotten(scene: Scene) -> None:
+    frame = StereoFrame(STAMP, *scene.render(0))
+    alone, both, neither = Segmenter(scene.rig), Segmenter(scene.rig), Segmenter(scene.rig)
+    good = Seed("good", pixel=scene.seed_pixel())
+    wrong = Seed("wrong", pixel=tuple(thread_pixels(scene)[40]))
+    alone.learn(frame, good)
+    for segmenter in (both, neither):
+        segmenter.learn(frame, wrong)
+        segmenter.learn(frame, good)
+    both.forget("wrong")
+    both.forget("unknown")
+    assert both.threads == ("good",)
+    assert both.step(frame).left.tobytes() == alone.step(frame).left.tobytes()
+    for thread in ("good", "wrong"):
+        neither.forget(thread)
+    untaught = Segmenter(scene.rig).step(frame).left.tobytes()
+    assert neither.step(frame).left.tobytes() == untaught
+
+
+def test_learned_contrast_stays_where_it_was_without_adaptation(scene: Scene) -> None:
+    frame = StereoFrame(STAMP, *scene.render(0))
+    bright = StereoFrame(STAMP, *(np.uint8(0.6 * image) for image in scene.render(0)))
+    fields = []
+    for adapt in (True, False):
+        still, led = (Segmenter(scene.rig, SegmentationConfig(adapt=adapt)) for _ in range(2))
+        for segmenter in (still, led):
+            segmenter.learn(frame, Seed(pixel=scene.seed_pixel()))
+        led.adapt(bright, thread_pixels(scene)[10:-10])
+        fields.append(still.step(frame).left.tobytes() == led.step(frame).left.tobytes())
+    assert fields == [False, True]
+
+
 @pytest.mark.parametrize("size", [(30, 30), (120, 90)])
 def test_an_area_gives_a_pixel_on_its_thread(scene: Scene, size: tuple[int, int]) -> None:
     image, pixels = scene.render(0)[0], thread_pixels(scene)
