@@ -29,6 +29,8 @@ from suturetrack.types import RidgeField, Seed, Stamp, StereoFrame, ThreadState,
 _log = logging.getLogger(__name__)
 _BACKLOG = 32
 """Values that may wait for the disk."""
+_PICTURE_FRAMES = 3
+"""Frames from one picture of the fields to the next, where it is all that is kept of them."""
 _STALL_SECONDS = 5.0
 _CLOSING_SECONDS = 10.0
 
@@ -50,7 +52,7 @@ class Recorder:
         config: object = None,
         *,
         patient: bool = True,
-        flush_seconds: float = 1.0,
+        flush_seconds: float = 0.5,
         part_bytes: int = 1 << 30,
     ) -> None:
         """Opens the file and writes what does not change: cameras, versions and parameters.
@@ -62,7 +64,7 @@ class Recorder:
             rig: the calibrated cameras.
             config: the process's parameters, a dataclass.
             patient: wait for a slow disk rather than leave something out.
-            flush_seconds: what a killed process loses at most.
+            flush_seconds: a killed process loses this, and what was being written.
             part_bytes: size at which the next part begins.
 
         Raises:
@@ -71,6 +73,7 @@ class Recorder:
         self.process = process
         self.left_out = 0
         """Values that were not recorded because the disk could not keep up."""
+        self._level, self._pictured = level, float("-inf")
         self._patient, self._pause = patient, max(flush_seconds, 0.01)
         self._stuck = False
         self._busy_since: float | None = None
@@ -114,10 +117,15 @@ class Recorder:
             self._hand_over(lambda file: file.frame(copy, at))
 
     def field(self, field: RidgeField, published_ns: int | None = None) -> None:
-        """Records both fields."""
-        if self._file is not None:
+        """Records both fields: all of them (full), or a picture of every third frame (light)."""
+        at = published_ns or time.time_ns()
+        # Counted from the last picture, because frames that were dropped never come here.
+        since = abs(field.stamp.frame - self._pictured)
+        if self._level == "light" and since < _PICTURE_FRAMES:
+            self.passed(field.stamp, at)
+        elif self._file is not None:
+            self._pictured = field.stamp.frame
             copy = replace(field, left=field.left.copy(), right=field.right.copy())
-            at = published_ns or time.time_ns()
             self._hand_over(lambda file: file.field(copy, at))
 
     def states(self, states: Sequence[ThreadState], published_ns: int | None = None) -> None:
@@ -126,7 +134,7 @@ class Recorder:
         self._hand_over(lambda file: file.states(states, at))
 
     def passed(self, stamp: Stamp, published_ns: int) -> None:
-        """Records that a frame was worked on while there was no thread."""
+        """Records that a frame was worked on of which there is nothing else to record."""
         self._hand_over(lambda file: file.passed(stamp, published_ns))
 
     def request(self, stamp: Stamp, request: Request) -> None:
