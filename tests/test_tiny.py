@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from services import segmenter, source, topics, tracker
-from services.bus import Bus
+from services.bus import Bus, NoAnswer
 from services.memory_transport import Hub
 from services.messages import Forget, Health
 from services.segmenter import SegmenterConfig
@@ -179,11 +180,6 @@ def test_a_seed_on_no_thread_ends_the_tracker_with_the_reason() -> None:
     assert "seed (5.0, 5.0)" in str(rig.errors["tracker"])
 
 
-def _length_mm(reason: str) -> float:
-    found = re.match(r"found ([0-9.]+) mm with confidence", reason)
-    return float(found[1]) if found else 0.0
-
-
 def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
     rig = Rig()
     operator = rig.connect("console")
@@ -197,7 +193,6 @@ def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
     good = operator.ask(topics.SEED, Seed("right", pixel=seed[0]), 30)
     outside = operator.ask(topics.SEED, Seed("left", pixel=(900.0, 5.0)), 30)
     nothing = operator.ask(topics.SEED, Seed("left", pixel=(5.0, 5.0)), 30)
-    again = operator.ask(topics.SEED, Seed("right", pixel=seed[0]), 30)
     assert good.stamp is not None
     state = next(s for s in states if s.thread == "right" and s.stamp >= good.stamp)
     forgotten = operator.ask(topics.FORGET, Forget("right"), 30)
@@ -210,10 +205,37 @@ def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
     assert "outside the 640x480 left image" in outside.reason
     assert not nothing.accepted
     assert nothing.stamp is not None
-    # What was learned on nothing does not spoil what is found next.
-    assert [_length_mm(reply.reason) for reply in (good, again)] == pytest.approx([107] * 2, abs=2)
     assert good.accepted
     # It is looked for in a field that was segmented with the thread's colour known.
-    assert float(good.reason.split("confidence ")[1][:4]) > 0.8
+    found = re.match(r"found ([0-9.]+) mm with confidence ([0-9.]+)", good.reason)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(107, abs=2)
+    assert float(found[2]) > 0.8
     assert good.curve is not None
     assert state.status is Status.TRACKING
+
+
+def test_a_seed_on_nothing_leaves_no_trace_once_it_is_refused() -> None:
+    """One picture again and again: a pixel of the ground teaches a look in which nothing is seen."""
+    scene, rig = open_scene("figure8-107"), Rig()
+    images, camera = scene.render(0), rig.connect("source")
+    camera.answer(topics.CALIBRATION, lambda _: scene.rig)
+    steps, drops = camera.every(topics.STEP), camera.every(topics.DROPPED)
+    fields = camera.every(topics.FIELD)
+    rig.start("segmenter", segmenter, SegmenterConfig(LOCKSTEP))
+    rig.start("tracker", tracker, TrackerConfig(LOCKSTEP))
+    assert camera.wait_for_alive("segmenter", 60)
+    assert camera.wait_for_alive("tracker", 60)
+    seen = []
+    for frame in range(34):
+        if frame == 1:
+            with suppress(NoAnswer):
+                camera.ask(topics.SEED, Seed("wrong", pixel=(141.0, 69.0)), timeout=0)
+        camera.publish(topics.FRAME, StereoFrame(Stamp(frame, frame, 0), *images))
+        assert steps.get(60) is not None
+        seen.append(next(iter(fields)).left.tobytes())
+    rig.stop()
+    assert not rig.errors
+    assert [drop.thread for drop in drain(drops)] == ["wrong"]
+    # Looked for in frames 1 to 30, and known to the segmenter in 2 to 30.
+    assert [field == seen[0] for field in seen] == [not 2 <= i <= 30 for i in range(34)]
