@@ -40,6 +40,8 @@ _GROWTH = 0.02
 _LEAST_LEFT = 0.65
 _ALL = 0.97
 _SURE_AFTER_S = 0.08
+# How long a doubtful end is held before it is cut off.
+_PATIENCE_S = 0.06
 _SOME = 0.2
 # Places on a thread that keep other threads away.
 _CLAIMS = 160
@@ -159,7 +161,7 @@ class Follower:
             self.last_good = model.curve
         elif self._lost and (evidence.share < _SOME or length < _LEAST_LEFT * self.known_length):
             self._start_again()
-        elif not certain and self.config.method != "paper":
+        elif uncertain_s > _PATIENCE_S and self.config.method != "paper":
             self._trim(wrong | self._doubt.hopeless)
         return status
 

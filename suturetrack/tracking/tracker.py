@@ -24,6 +24,8 @@ from suturetrack.types import Energies, Nurbs, RidgeField, Seed, Stamp, Status, 
 FORGOTTEN = "forgotten"
 """Event of the last state of a thread that was dropped."""
 _BETWEEN_ATTEMPTS_NS = 150_000_000
+# After so many the attempts become rarer, for each takes as long as many fields.
+_QUICK_ATTEMPTS = 6
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
 
@@ -47,6 +49,8 @@ class _Thread:
     """Curve of the thread that had the name before."""
     wait_ns: int = 0
     """Until when the lost thread is not looked for again."""
+    failures: int = 0
+    """How often it was looked for in vain."""
     rows: int = 0
     """How much lower than the calibration says the right view shows the thread, px."""
 
@@ -127,7 +131,7 @@ class Tracker:
         state = follower.step(field, name, self._others(name, field))
         was_lost = thread.last is not None and thread.last.status is Status.LOST
         if state.status is not Status.LOST:
-            thread.wait_ns = 0
+            thread.wait_ns = thread.failures = 0
             return replace(state, events=("recovered", *state.events)) if was_lost else state
         if not was_lost:
             state = replace(state, events=("lost", *state.events))
@@ -146,7 +150,9 @@ class Tracker:
         """The state of a lost thread that is found again, every now and then looked for."""
         if field.stamp.capture_ns < thread.wait_ns:
             return None
-        thread.wait_ns = field.stamp.capture_ns + _BETWEEN_ATTEMPTS_NS
+        patience = min(max(thread.failures - _QUICK_ATTEMPTS, 0), 2)
+        thread.wait_ns = field.stamp.capture_ns + (_BETWEEN_ATTEMPTS_NS << patience)
+        thread.failures += 1
         curve = find_again(last, known_length, thread.seed, field, self._rig, self._initialization)
         others = self._others(name, field)
         if curve is None or lies_on(curve, others, self._rig):
