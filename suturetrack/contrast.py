@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from suturetrack.kernels.ridge import gaussian_taps
-from suturetrack.types import Float64, Image, InputError
+from suturetrack.types import Float64, Image
 
 SIGMAS = (1.2, 2.4, 4.8)
 """Scales at which a thread is looked for, px."""
@@ -28,8 +28,6 @@ GRAY = np.array([29.0, 150.0, 77.0]) / 256
 _WINDOW_PX = 64
 _SNAP_PX = 8
 _STARTS = 4
-# Of an area, at which the image is looked at first.
-_MOST_PIXELS = 20_000
 _ROUNDS = 2
 _SHORTEST_PX = 20
 # Threads stand out from the clutter by 2.1 to 6.6 (median 4), textures by up to 2.2 (median 0.5).
@@ -116,37 +114,6 @@ def contrast_at(image: Image, pixel: tuple[float, float]) -> Contrast | None:
     sigma = max(SIGMAS[0], 0.6 * sigma)
     scene = _Scene.of(crop, sigma)
     return _contrast(scene.clutter, ridge.across(scene), sigma, channel_means(image))
-
-
-def pixel_in_area(image: Image, corners: Float64) -> tuple[float, float] | None:
-    """A seed on the ridge within a box that looks most like a thread; None where nothing does.
-
-    Args:
-        image: (H, W, 3) BGR or (H, W) gray, uint8.
-        corners: (2, 2) pixels (u, v) of two opposite corners, of which a part lies in the image.
-
-    Raises:
-        InputError: the box is wholly outside the image.
-    """
-    height, width = image.shape[:2]
-    low = np.maximum(np.floor(corners.min(0)), 0).astype(int)
-    high = np.minimum(np.ceil(corners.max(0)) + 1, (width, height)).astype(int)
-    if (low >= high).any():
-        raise InputError(f"area {corners.tolist()}: outside the {width}x{height} image")
-    from_u, from_v = np.maximum(low - _WINDOW_PX // 2, 0)
-    crop = image[from_v : high[1] + _WINDOW_PX // 2, from_u : high[0] + _WINDOW_PX // 2]
-    step = math.ceil(math.sqrt(np.prod(high - low) / _MOST_PIXELS))
-    grid = np.mgrid[low[1] : high[1] : step, low[0] : high[0] : step].reshape(2, -1)
-    v, u = grid - np.array([[from_v], [from_u]])
-    found = []
-    for sigma in SIGMAS:
-        unlike = _most_unlike(_Scene.of(crop, sigma), v, u)[0]
-        for i in _peaks(unlike, v, u, apart=_SNAP_PX):
-            pixel = float(u[i] + from_u), float(v[i] + from_v)
-            contrast = contrast_at(image, pixel)
-            if contrast is not None:
-                found.append((contrast.stands_out(contrast.weights), pixel))
-    return max(found)[1] if found else None
 
 
 def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:

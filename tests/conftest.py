@@ -31,11 +31,11 @@ def make_rig(baseline: float = 40.0, metres_per_unit: float = 1e-3) -> StereoRig
     )
 
 
-def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+def wait_until(condition: Callable[[], object], seconds: float = 30.0) -> None:
     """Returns as soon as the condition holds; fails when it does not in time."""
     deadline = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < deadline
+        assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.005)
 
 

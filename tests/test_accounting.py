@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -16,6 +16,7 @@ import pytest
 from services import topics
 from services.bus import Bus, Reader
 from services.zenoh_transport import ZenohTransport, local_config, remove_sockets
+from tests.conftest import wait_until
 
 SENDER = """
 import sys, time
@@ -88,13 +89,6 @@ def consumers() -> Iterator[list[Consumer]]:
     remove_sockets("test")
 
 
-def until(condition: Callable[[], bool], seconds: float = 30) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.01)
-
-
 @pytest.mark.parametrize("flood", [600, pytest.param(20_000, marks=pytest.mark.long)])
 def test_sent_is_read_and_counted_drops(rig_name: str, flood: int) -> None:
     with consumers() as all_of_them, start_sender(flood) as sender:
@@ -104,7 +98,7 @@ def test_sent_is_read_and_counted_drops(rig_name: str, flood: int) -> None:
         sent = int(sender.stdout.readline())
         assert sent == flood + 20
         for consumer in all_of_them:
-            until(lambda consumer=consumer: consumer.accounted() == sent)  # type: ignore[misc]
+            wait_until(lambda consumer=consumer: consumer.accounted() == sent)  # type: ignore[misc]
         sender.stdin.close()
         # A flood is more than the slow ones can take.
         slow, still = all_of_them[1:3]
@@ -123,7 +117,7 @@ def test_nothing_is_silent_while_senders_are_killed(rig_name: str, kills: int) -
                 assert sender.stdout
                 assert sender.stdout.readline() == "begun\n"
                 before = all_of_them[3].read
-                until(lambda before=before: all_of_them[3].read > before + 20)  # type: ignore[misc]
+                wait_until(lambda before=before: all_of_them[3].read > before + 20)  # type: ignore[misc]
                 time.sleep(chance.uniform(0, 0.05))
                 sender.kill()
         with start_sender(0) as sender:
@@ -133,7 +127,7 @@ def test_nothing_is_silent_while_senders_are_killed(rig_name: str, kills: int) -
             assert sender.stdout.readline() == "20\n"
             for consumer in all_of_them:
                 # By now the last of every sender's messages has arrived.
-                until(lambda c=consumer: c.accounted() == sum(c.reader.expected.values()))  # type: ignore[misc]
+                wait_until(lambda c=consumer: c.accounted() == sum(c.reader.expected.values()))  # type: ignore[misc]
                 assert len(consumer.reader.expected) == kills + 1
                 assert min(consumer.reader.expected.values()) >= 20
             sender.stdin.close()

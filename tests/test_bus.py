@@ -29,6 +29,7 @@ from services.zenoh_transport import (
     socket_directory,
 )
 from suturetrack.types import InputError, Seed, Stamp, StereoFrame
+from tests.conftest import wait_until
 
 Connect = Callable[[str], Bus]
 
@@ -58,13 +59,6 @@ def stamp(frame: int) -> Stamp:
     return Stamp(frame, frame * 33_000_000, time.time_ns())
 
 
-def until(condition: Callable[[], bool], seconds: float = 10) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.005)
-
-
 def test_every_reader_gets_all_in_order(connect: Connect) -> None:
     tracker, source = connect("tracker"), connect("source")
     reader = source.every(topics.STEP)
@@ -82,7 +76,7 @@ def test_a_reader_of_the_newest_passes_over_the_rest_and_counts_them(connect: Co
     assert tracker.wait_for_readers(topics.STEP, 10)
     for frame in range(100):
         tracker.publish(topics.STEP, stamp(frame))
-    until(lambda: reader.passed_over == 99)
+    wait_until(lambda: reader.passed_over == 99)
     newest = reader.get(1)
     assert newest is not None
     assert newest.frame == 99
@@ -158,7 +152,7 @@ def test_those_alive_are_seen_to_come_and_go(connect: Connect) -> None:
     tracker.declare_alive()
     assert run.wait_for_alive("tracker", 10)
     tracker.close()
-    until(lambda: not run.alive())
+    wait_until(lambda: not run.alive())
 
 
 def put(bus: Bus, key: str, packet: Packet) -> None:
@@ -222,7 +216,7 @@ def test_the_last_messages_outlive_their_sender(connect: Connect) -> None:
     for thread, u in (("a", 1.0), ("b", 9.0), ("a", 2.0), ("b", 3.0), ("b", 9.0)):
         tracker.publish(topics.SEEDING, Seed(thread, pixel=(u, u)))
     put(tracker, "thread/c/seeding", Packet("application/msgpack;seed/1", b"\xff", b"\x80"))
-    until(lambda: source.refused == 1)
+    wait_until(lambda: source.refused == 1)
     tracker.close()
     console = connect("console")
     found = list[Seed]()
@@ -231,7 +225,7 @@ def test_the_last_messages_outlive_their_sender(connect: Connect) -> None:
         found[:] = console.last(topics.SEEDING)
         return bool(found)
 
-    until(asked)
+    wait_until(asked)
     assert {seed.thread: seed.pixel for seed in found} == {"a": (2.0, 2.0), "b": (3.0, 3.0)}
     assert console.last(topics.STEP) == []
 
@@ -284,7 +278,7 @@ def test_a_killed_process_is_seen_to_die_and_may_come_back(rig_name: str) -> Non
             assert reader.get(10) is not None
             other.send_signal(signal.SIGKILL)
             other.wait()
-            until(lambda: not source.alive())
+            wait_until(lambda: not source.alive())
             while reader.get(0.05):
                 pass
     finally:
@@ -405,7 +399,7 @@ def test_images_come_through_shared_memory_and_nothing_of_it_stays(rig_name: str
         sender.stdin.flush()
         return bool(shared)
 
-    until(arrived, 20)
+    wait_until(arrived, 20)
     assert shared[0]
     files = _mapped(sender.pid)
     assert files

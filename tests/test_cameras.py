@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -20,6 +19,7 @@ from services.sources import InputConfig, camera, live, open_input
 from services.sources.footage import Footage, Stalled
 from services.sources.interlace import CombWatch, combing
 from suturetrack.types import Image, InputError
+from tests.conftest import wait_until
 from tests.test_sources import HEIGHT, WIDTH, both, calibration, picture, told
 
 __all__ = ["calibration"]
@@ -81,13 +81,6 @@ def devices(monkeypatch: pytest.MonkeyPatch) -> Devices:
     return found
 
 
-def until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.005)
-
-
 def stall_of(footage: Footage) -> str:
     """What is said once the frames that were on their way have been read."""
     for i in range(1, 100):
@@ -132,7 +125,7 @@ def test_a_camera_that_stalls_is_told_and_comes_back(devices: Devices, calibrati
     devices.gone.clear()
     devices.stalled.clear()
     devices.images = {0: both(3)}
-    until(lambda: devices.opened > before)
+    wait_until(lambda: devices.opened > before)
     exposure = footage.read(1)
     assert exposure is not None
     assert told(exposure.left) == (3, 0)
@@ -176,15 +169,15 @@ def test_the_source_says_that_its_camera_stalls_and_goes_on(
     thread.start()
     assert frames.get(20) is not None
     devices.stalled.set()
-    until(lambda: service.health().warning)
+    wait_until(lambda: service.health().warning)
     assert service.health().warning.startswith("camera 0: no image for ")
     while frames.get(0) is not None:
         pass
     devices.stalled.clear()
     assert frames.get(20) is not None
-    until(lambda: not service.health().warning)
+    wait_until(lambda: not service.health().warning)
     devices.stalled.set()
-    until(lambda: service.health().warning)
+    wait_until(lambda: service.health().warning)
     service.bus.stop.set()
     thread.join(20)
     assert not thread.is_alive()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +26,7 @@ from suturetrack.types import (
     Status,
     ThreadState,
 )
+from tests.conftest import wait_until
 
 PERIOD_NS = 33_333_333
 
@@ -62,15 +63,8 @@ def stage(curve: Nurbs) -> Iterator[Stage]:
     stage.tracker.close()
 
 
-def until(condition: Callable[[], object], seconds: float = 20) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.002)
-
-
 def wait_for_frame(client: Client, frame: int) -> Seen:
-    until(lambda: (s := client.latest()) is not None and s.state.stamp.frame == frame)
+    wait_until(lambda: (s := client.latest()) is not None and s.state.stamp.frame == frame)
     seen = client.latest()
     assert seen is not None
     return seen
@@ -85,7 +79,7 @@ def follow(stage: Stage, thread: str | None = None) -> list[tuple[str, int, str]
 
     listeners = len(stage.client._listeners)
     stage.client.watch(note, thread)
-    until(lambda: len(stage.client._listeners) > listeners)
+    wait_until(lambda: len(stage.client._listeners) > listeners)
     return got
 
 
@@ -94,7 +88,7 @@ def test_states_arrive_in_order_and_by_thread(stage: Stage) -> None:
     for frame in range(5):
         stage.publish(frame, "a")
         stage.publish(frame, "b")
-    until(lambda: len(both) >= 10 and len(one) >= 5)
+    wait_until(lambda: len(both) >= 10 and len(one) >= 5)
     assert [(t, f) for t, f, _ in both[:10]] == [(t, f) for f in range(5) for t in "ab"]
     assert [(t, f) for t, f, _ in one[:5]] == [("b", f) for f in range(5)]
     assert set(stage.client.threads) == {"a", "b"}
@@ -110,7 +104,7 @@ def test_silence_is_told_once_and_in_time(stage: Stage) -> None:
     got = follow(stage)
     began = time.time_ns()
     stage.publish(7)
-    until(lambda: len(got) == 2)
+    wait_until(lambda: len(got) == 2)
     assert time.time_ns() - began < 10 * PERIOD_NS
     assert [(frame, bool(reason)) for _, frame, reason in got] == [(7, False), (7, True)]
     assert "nothing came" in got[1][2]
@@ -118,7 +112,7 @@ def test_silence_is_told_once_and_in_time(stage: Stage) -> None:
     assert latest is not None
     assert not latest.live
     stage.publish(8)
-    until(lambda: len(got) == 4)
+    wait_until(lambda: len(got) == 4)
     assert [(frame, bool(reason)) for _, frame, reason in got[2:]] == [(8, False), (8, True)]
 
 
@@ -127,7 +121,7 @@ def test_no_live_state_is_older_than_three_periods(stage: Stage) -> None:
     for frame, delay_ms in enumerate((0, 30, 60, 95)):
         stage.publish(frame, age_ms=delay_ms)
         seen = wait_for_frame(stage.client, frame)
-        until(lambda seen=seen: not seen.live)  # type: ignore[misc]
+        wait_until(lambda seen=seen: not seen.live)  # type: ignore[misc]
         assert seen.freshness.left_ns == 0
         stale_at_ns = seen.state.stamp.released_ns + 3 * PERIOD_NS
         assert time.time_ns() - stale_at_ns < 5 * PERIOD_NS
@@ -137,7 +131,7 @@ def test_a_tracker_that_repeats_old_frames_is_stale(stage: Stage) -> None:
     got = follow(stage)
     for _ in range(20):
         stage.publish(3, age_ms=101)
-    until(lambda: len(got) == 20)
+    wait_until(lambda: len(got) == 20)
     assert all("old" in reason for _, _, reason in got)
 
 
@@ -147,7 +141,7 @@ def test_gaps_in_the_numbers_are_counted(stage: Stage) -> None:
     state = replace(stage.state, stamp=Stamp(0, 0, time.time_ns(), PERIOD_NS))
     for number in (0, 1, 4, 5, 9):
         sender.put(key, wire.encode(state, "tracker-1", number), large=False)
-    until(lambda: len(got) >= 5)
+    wait_until(lambda: len(got) >= 5)
     assert stage.client.missed == 2 + 3
 
 
@@ -155,7 +149,7 @@ def test_a_slow_loop_delays_nobody_and_its_losses_are_counted(stage: Stage) -> N
     slow = stage.client.states()
     thread = threading.Thread(target=lambda: next(slow))
     thread.start()
-    until(lambda: len(stage.client._listeners) == 1)
+    wait_until(lambda: len(stage.client._listeners) == 1)
     stage.publish(1)
     thread.join(10)
     for frame in range(2, 1100):
@@ -176,10 +170,10 @@ def test_a_callback_that_fails_is_called_again(
         raise RuntimeError("mine")
 
     stage.client.watch(fail)
-    until(lambda: len(stage.client._listeners) == 1)
+    wait_until(lambda: len(stage.client._listeners) == 1)
     stage.publish(1)
     stage.publish(2)
-    until(lambda: len(calls) >= 2)
+    wait_until(lambda: len(calls) >= 2)
     assert "a callback failed on frame 1" in caplog.text
 
 
@@ -233,14 +227,14 @@ def test_a_forgotten_thread_is_gone_after_its_last_state(stage: Stage) -> None:
     stage.tracker.declare_alive()
     got = follow(stage)
     stage.publish(1, "a")
-    until(lambda: stage.client.threads == ("a",))
+    wait_until(lambda: stage.client.threads == ("a",))
     assert stage.client.forget("a")
     assert not stage.client.forget("b")
     stamp = Stamp(2, 2 * PERIOD_NS, time.time_ns(), PERIOD_NS)
     last = replace(stage.state, stamp=stamp, thread="a", events=("forgotten",))
     stage.tracker.publish(topics.STATE, last)
-    until(lambda: stage.client.threads == ())
-    until(lambda: [frame for _, frame, _ in got][:2] == [1, 2])
+    wait_until(lambda: stage.client.threads == ())
+    wait_until(lambda: [frame for _, frame, _ in got][:2] == [1, 2])
 
 
 def test_nobody_there_is_said_plainly(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search, spline
 from tests.reference import curve_fit as reference
+from tests.reference import strands as strands_reference
 
 RNG = np.random.default_rng(3)
 KNOTS = nurbs.clamped_knots(np.array([0.07, 0.2, 0.45, 0.5, 0.81]), 3)
@@ -113,3 +114,44 @@ def test_short_runs_are_dropped() -> None:
     flags = np.array([1, 1, 0, 1, 1, 1, 0, 1], bool)
     kept = search.solid(flags, np.full(8, 2.0), 5.0)
     np.testing.assert_array_equal(kept, [0, 0, 0, 1, 1, 1, 0, 0])
+
+
+def random_strand(rng: np.random.Generator, count: int) -> strands_reference.Strand:
+    """A wavy line through a small image."""
+    t = np.linspace(0, 1, count)
+    pixels = np.c_[60 * t, 20 + 12 * np.sin(rng.uniform(2, 9) * t + rng.uniform(0, 6))]
+    tangents = np.gradient(pixels, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    return pixels, tangents, 60 * t
+
+
+@given(st.integers(0, 10_000))
+def test_strands_are_kept_apart_as_their_twins_do(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    own, other = random_strand(rng, 40), random_strand(rng, 55)
+    offsets = np.arange(-8, 8.1, 0.5)
+    for apart in (0.0, 25.0):
+        np.testing.assert_array_equal(
+            search.claimed(own, other, offsets, apart),
+            strands_reference.claimed(own, other, offsets, apart),
+        )
+        np.testing.assert_array_equal(
+            search.doubled(own, other, apart), strands_reference.doubled(own, other, apart)
+        )
+    np.testing.assert_array_equal(
+        search.covered(own[0], own[1], offsets, other[0], 3.0),
+        strands_reference.covered(own[0], own[1], offsets, other[0], 3.0),
+    )
+
+
+def test_a_place_belongs_to_the_strand_that_is_nearest() -> None:
+    along = np.arange(0.0, 40.0)
+    east = np.tile([1.0, 0.0], (40, 1))
+    own = np.c_[along, np.zeros(40)], east, along
+    beside = np.c_[along, np.full(40, 6.0)], east, np.full(40, np.inf)
+    offsets = np.arange(-8.0, 8.1, 1.0)
+    taken = search.claimed(own, beside, offsets, 45.0)[20]
+    assert offsets[taken].tolist() == [4.0, 5.0, 6.0, 7.0, 8.0]
+    assert not search.doubled(own, beside, 45.0).any()
+    assert search.doubled(own, (own[0], east, np.full(40, np.inf)), 45.0).all()
+    assert not search.doubled(own, own, 45.0).any()

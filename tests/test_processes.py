@@ -25,6 +25,7 @@ from services.zenoh_transport import ZenohTransport, local_config
 from suturetrack.calibration import save_calibration
 from suturetrack.stage import open_scene
 from suturetrack.types import Status, ThreadState
+from tests.conftest import wait_until
 
 FRAMES = 10
 PROCESSES = {"source", "segmenter", "tracker"}
@@ -50,13 +51,6 @@ def start(rig_name: str) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     for process in started:
         process.kill()
         process.communicate()
-
-
-def until(condition: Callable[[], object], seconds: float = 30) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
 
 
 def sockets() -> list[Path]:
@@ -132,9 +126,9 @@ def test_the_source_may_start_first(start: Callable[..., subprocess.Popen[str]])
     """The launcher starts the tracker first; processes that depend on nobody's order do this too."""
     options = ("--lockstep", "--rig", "test")
     source = start("source", *STAGE, "--frames", 4, *options)
-    until(lambda: len(sockets()) == 1)
+    wait_until(lambda: len(sockets()) == 1)
     others = [start("tracker", *options)]
-    until(lambda: len(sockets()) == 2)
+    wait_until(lambda: len(sockets()) == 2)
     others.append(start("segmenter", *options))
     assert source.wait(60) == 0
     for process in others:
@@ -217,7 +211,7 @@ def test_two_runs_at_once_keep_apart_and_a_name_is_used_once(
     tmp_path: Path,
 ) -> None:
     first = start("run", *STAGE, "--run-dir", tmp_path / "a", "--rig", "bench")
-    until(lambda: len(sockets()) == 4)
+    wait_until(lambda: len(sockets()) == 4)
     refused = start("run", *STAGE, "--run-dir", tmp_path / "b", "--rig", "bench")
     _, err = refused.communicate(timeout=20)
     assert refused.returncode == 1

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +36,7 @@ from suturetrack.types import (
     ThreadState,
     Truth,
 )
+from tests.conftest import wait_until
 
 STAMP = Stamp(7, 1_234_567_890_123, 1_700_000_000_000_000_000)
 PUBLISHED = STAMP.released_ns + 12_500_000
@@ -56,13 +56,6 @@ def make_state(curve: Nurbs, status: Status = Status.TRACKING, stamp: Stamp = ST
         seen=abs(s - 0.5) > 1 / 6,
         events=("one control point inserted",),
     )
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def rows(folder: RunFolder, entity: str) -> list[dict[str, Any]]:

@@ -8,7 +8,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from services.sources import ros2 as ros2_source
 from services.sources.ros_image import CAMERA_INFO, IMAGE
 from suturetrack import nurbs
 from suturetrack.types import Energies, InputError, Nurbs, Stamp, Status, ThreadState
+from tests.conftest import wait_until
 from tests.test_bags import LEFT, RIGHT, Ros
 from tests.test_cameras import stall_of
 from tests.test_sources import HEIGHT, WIDTH, picture, told
@@ -44,13 +45,6 @@ KINDS = {
     GRASP: "geometry_msgs/msg/PoseStamped",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
-
-
-def until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.01)
 
 
 def session(mode: str, **endpoints: str) -> zenoh.Session:
@@ -91,7 +85,7 @@ class Listener:
 
     def message(self, topic: str, kind: str) -> Any:
         """The last message of a topic, once there is one."""
-        until(lambda: self.of(topic))
+        wait_until(lambda: self.of(topic))
         return STORE.deserialize_cdr(self.of(topic)[-1].payload.to_bytes(), kind)
 
     def tokens(self) -> list[str]:
@@ -113,7 +107,7 @@ class Bridge:
         self._config = config
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
-        until(lambda: self.failure or "ros2" in self.tracker.alive())
+        wait_until(lambda: self.failure or "ros2" in self.tracker.alive())
 
     def _run(self) -> None:
         try:
@@ -180,7 +174,7 @@ def test_tokens_and_keys_are_those_of_rmw_zenoh(router: str) -> None:
     chatter = node.publisher("/chatter", "std_msgs/msg/String")
     node.subscribe("/robot1/chatter", "std_msgs/msg/String", lambda _: None, lambda _: None)
     kind = f"std_msgs::msg::dds_::String_/RIHS01_{HASHES['std_msgs/msg/String']}"
-    until(lambda: len(listener.tokens()) == 3)
+    wait_until(lambda: len(listener.tokens()) == 3)
     tokens = listener.tokens()
     zid = tokens[0].split("/")[2]
     assert len(zid) in (31, 32)
@@ -194,7 +188,7 @@ def test_tokens_and_keys_are_those_of_rmw_zenoh(router: str) -> None:
     )
     chatter.publish(new("std_msgs/msg/String", data="hello"))
     chatter.publish(new("std_msgs/msg/String", data="again"))
-    until(lambda: len(listener.of("/chatter")) == 2)
+    wait_until(lambda: len(listener.of("/chatter")) == 2)
     samples = listener.of("/chatter")
     assert str(samples[0].key_expr) == f"2/chatter/{kind}"
     assert samples[0].payload.to_bytes() == b"\x00\x01\x00\x00\x06\x00\x00\x00hello\x00"
@@ -210,7 +204,7 @@ def test_tokens_and_keys_are_those_of_rmw_zenoh(router: str) -> None:
         assert any(gid)
     assert numbers == [1, 2]
     node.close()
-    until(lambda: not listener.tokens())
+    wait_until(lambda: not listener.tokens())
     listener.session.close()
 
 
@@ -282,11 +276,11 @@ def test_a_lost_thread_is_shown_nowhere_and_silence_is_told(
     running.tracker.publish(topics.STATE, replace(state, status=Status.LOST))
     assert listener.message(CURVE, KINDS[CURVE]).poses == []
     assert listener.message(MARKER, KINDS[MARKER]).action == 2
-    until(lambda: listener.of("/diagnostics"))
+    wait_until(lambda: listener.of("/diagnostics"))
     (entry,) = listener.message("/diagnostics", KINDS["/diagnostics"]).status
     assert (entry.level, entry.message) in ((2, "lost"), (3, "no states come"))
     assert not listener.of(GRASP)
-    until(lambda: listener.message("/diagnostics", KINDS["/diagnostics"]).status[0].level == 3)
+    wait_until(lambda: listener.message("/diagnostics", KINDS["/diagnostics"]).status[0].level == 3)
 
 
 def point(frame_id: str, *xyz: float) -> Any:
@@ -318,18 +312,20 @@ def test_seeds_of_ros_reach_the_tracker(bridge: tuple[Bridge, Listener], router:
             asked.append(request.question)
             request.answer(SeedReply(request.question.thread, True, "found 120.0 mm"))
 
-    until(lambda: (answer(), asked)[1])
+    wait_until(lambda: (answer(), asked)[1])
     assert asked[0].thread == "0"
     assert asked[0].point == pytest.approx((0.01, -0.02, 0.2))
-    until(lambda: "found 120.0 mm" in said(listener))
-    until(lambda: (running.seeds.get(0.2)) is None)
+    wait_until(lambda: "found 120.0 mm" in said(listener))
+    wait_until(lambda: (running.seeds.get(0.2)) is None)
     seeds.publish(point("base_link", 0, 0, 0.2))
-    until(lambda: "it is in frame 'base_link'; transform it to 'suturetrack'" in said(listener))
+    wait_until(
+        lambda: "it is in frame 'base_link'; transform it to 'suturetrack'" in said(listener)
+    )
     seeds.publish(point("", 0, float("nan"), 0.2))
-    until(lambda: "its coordinates are not finite" in said(listener))
+    wait_until(lambda: "its coordinates are not finite" in said(listener))
     key = next(t for t in listener.tokens() if "/MS/" in t).split("/")
     listener.session.put(f"{domain}{SEED}/{key[10]}/{key[11]}", b"junk")
-    until(lambda: "Invalid or unsupported CDR" in said(listener))
+    wait_until(lambda: "Invalid or unsupported CDR" in said(listener))
     node.close()
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from suturetrack.camera import StereoRig
-from suturetrack.contrast import GRAY, SIGMAS, contrast_at, pixel_in_area
+from suturetrack.contrast import GRAY, SIGMAS, contrast_at
 from suturetrack.kernels import ridge
 from suturetrack.segmentation import (
     SegmentationConfig,
@@ -418,28 +418,6 @@ def test_learned_contrast_stays_where_it_was_without_adaptation(scene: Scene) ->
         led.adapt(bright, thread_pixels(scene)[10:-10])
         fields.append(still.step(frame).left.tobytes() == led.step(frame).left.tobytes())
     assert fields == [False, True]
-
-
-@pytest.mark.parametrize("size", [(30, 30), (120, 90)])
-def test_an_area_gives_a_pixel_on_its_thread(scene: Scene, size: tuple[int, int]) -> None:
-    image, pixels = scene.render(0)[0], thread_pixels(scene)
-    for i in (20, len(pixels) // 2, len(pixels) - 30):
-        half = np.array(size) / 2
-        middle = pixels[i] + (0.3, -0.2) * half
-        corners = np.array([middle - half, middle + half])
-        found = pixel_in_area(image, corners)
-        assert found is not None
-        assert np.linalg.norm(pixels - found, axis=1).min() <= 2.0
-        assert (corners[0] - 1 <= found).all()
-        assert (found <= corners[1] + 1).all()
-        assert pixel_in_area(image, corners[::-1]) == found
-
-
-def test_an_area_without_a_thread_gives_none() -> None:
-    noise = np.random.default_rng(0).normal(128, 3, (120, 160, 3)).round().astype(np.uint8)
-    assert pixel_in_area(noise, np.array([[20.0, 20.0], [60.0, 70.0]])) is None
-    with pytest.raises(InputError, match="outside the 160x120 image"):
-        pixel_in_area(noise, np.array([[200.0, 20.0], [260.0, 70.0]]))
 
 
 def test_a_wide_thread_gets_a_wide_filter() -> None:
