@@ -14,6 +14,8 @@ import zenoh
 from services.zenoh_transport import explain, load_config
 from suturetrack.types import InputError
 
+_LONGEST_WAIT_S = 0.25
+
 
 @dataclass(frozen=True)
 class RouterConfig:
@@ -45,7 +47,9 @@ def run(config: RouterConfig) -> None:
     try:
         with zenoh.open(settings):
             print(f"router: listening on {', '.join(_endpoints(settings))}", flush=True)
-            stop.wait()
+            # A signal may reach another thread than this one, which handles it when it wakes up.
+            while not stop.wait(_LONGEST_WAIT_S):
+                pass
     except zenoh.ZError as error:
         raise InputError(explain(error)) from error
 

@@ -247,7 +247,12 @@ def test_a_rig_runs_behind_the_router(tmp_path: Path) -> None:
     finally:
         for process in running:
             process.terminate()
-        assert [process.wait(20) for process in running] == [0, 0, 0, 0]
+        try:
+            assert [process.wait(30) for process in running] == [0, 0, 0, 0]
+        finally:
+            for process in running:
+                process.kill()
+                process.wait()
 
 
 def seeded(client: Client) -> bool:
