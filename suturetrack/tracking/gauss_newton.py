@@ -269,10 +269,6 @@ class _Equations:
         weighted = weight[:, None] * row
         self.add(samples, times, weighted[:, :, None] * row[:, None, :], weighted * goal[:, None])
 
-    def add_point(self, samples: Samples, times: int, weight: Float64, goal: Float64) -> None:
-        """Rows d = goal, in all three coordinates."""
-        self.add(samples, times, weight[:, None, None] * np.eye(3), weight[:, None] * goal)
-
     def solve(self) -> Float64:
         """(n + 1, 3) step; leaves the factor in the band."""
         spline.factorize(self.band)
