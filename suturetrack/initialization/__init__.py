@@ -98,7 +98,12 @@ def _initialize(
     if found is not None and not rows:
         return found
     moved = RidgeField(field.stamp, field.left, raised(field.right, rows))
-    other = _reconstruct(moved, left, rig, origin, pixel, config, scale)
+    try:
+        other = _reconstruct(moved, left, rig, origin, pixel, config, scale)
+    except InitializationError:
+        if found is None:
+            raise
+        return found
     # The calibration stands unless its rows spoil the curve.
     if found is None or abs(np.log(length(found.curve) / length(other.curve))) > _SPOILT:
         found = replace(other, row_offset_px=scale * rows)
