@@ -37,6 +37,7 @@ _RETRY = 5
 _LENGTH_TOLERANCE = 0.05
 # A thread of which something is hidden has not grown by more.
 _GROWTH = 0.02
+_NOISE_SIGMAS = 3.0
 _LEAST_LEFT = 0.65
 _ALL = 0.97
 _SURE_AFTER_S = 0.08
@@ -118,13 +119,13 @@ class Follower:
         if inserted or removed:
             events.append(f"control points: {inserted} inserted, {removed} removed")
         astray, plain = evidence.astray(field, self.rig, model.levels, neighbours)
-        overlong = self._overlong(plain)
+        overlong = self._overlong(plain, evidence)
         wrong = astray | (~plain & overlong)
         status = self._judge(evidence, wrong, plain, overlong)
         return self._state(field, thread, evidence, status, events)
 
-    def _overlong(self, plain: Bool) -> bool:
-        """Whether the thread seems to have grown.
+    def _overlong(self, plain: Bool, evidence: Evidence) -> bool:
+        """Whether the thread seems to have grown, by more than noise in depth makes of its length.
 
         Where all of it is plain to see and an end seems to go on, the end has met something else;
         where it is not, the curve makes a detour.
@@ -132,7 +133,8 @@ class Follower:
         ends = self.model.ends
         length = length_of(self.model.curve) if plain.mean() > _ALL else ends.wanted
         self._established |= ends.settled
-        return self._established and length > (1 + _GROWTH) * self.known_length
+        noise = _NOISE_SIGMAS * float(np.median(evidence.evenly()[0]))
+        return self._established and length > (1 + _GROWTH) * self.known_length + noise
 
     def _judge(self, evidence: Evidence, wrong: Bool, plain: Bool, overlong: bool) -> Status:
         """The status; a curve that was lost must have its length again to be held."""
@@ -169,9 +171,9 @@ class Follower:
     def _short(self) -> bool:
         """Whether a part that was cut off has not been found again."""
         length = length_of(self.model.curve)
-        self._cut &= length < (1 - _LENGTH_TOLERANCE) * self.known_length
+        self._cut &= length < (1 - _GROWTH) * self.known_length
         self._cut &= not self.model.ends.at_border
-        return self._cut
+        return self._cut and length < (1 - _LENGTH_TOLERANCE) * self.known_length
 
     def _trim(self, wrong: Bool) -> None:
         """Cuts off what has left the thread at an end, to be found anew."""
