@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 
@@ -32,19 +32,21 @@ from services.checks import check, check_name
 from services.freshness import Freshness
 from services.inbox import Inbox
 from services.messages import Forget, GraspRequest, SeedReply, ToolPose
-from services.topics import Question
+from services.topics import Question, Topic
 from services.zenoh_transport import ZenohTransport, load_config, local_config
 from suturetrack.camera import StereoRig
 from suturetrack.grasping import AWAY_FROM_CAMERA, GraspPoint
 from suturetrack.initialization import InitializationError
-from suturetrack.snapping import point_of_right_pixel
+from suturetrack.snapping import laser_spot, pixel_in_area, point_of_right_pixel
 from suturetrack.tracking.tracker import FORGOTTEN
-from suturetrack.types import Float64, Grasp, InputError, RidgeField, Seed, ThreadState
+from suturetrack.types import Float64, Grasp, InputError, Seed, ThreadState
 
 Q = TypeVar("Q")
 A = TypeVar("A")
+T = TypeVar("T")
 Pixel = tuple[float, float]
 Point = tuple[float, float, float]
+Area = tuple[float, float, float, float]
 
 _ARRIVAL_S = 3.0
 """How long whoever answers may take to appear."""
@@ -121,7 +123,7 @@ class Client:
         self._latest: dict[str, Seen] = {}
         self._listeners: dict[Inbox[Seen], str | None] = {}
         self._given_up = 0
-        self._fields: Reader[RidgeField] | None = None
+        self._readers: dict[str, Reader[Any]] = {}
         threading.Thread(target=self._listen, name="states", daemon=True).start()
 
     @property
@@ -185,6 +187,8 @@ class Client:
         *,
         view: Literal["left", "right"] = "left",
         point: Point | None = None,
+        area: Area | None = None,
+        laser: bool = False,
         thread: str = "0",
         timeout: float = 10.0,
     ) -> SeedReply:
@@ -192,16 +196,27 @@ class Client:
 
         Args:
             pixel: (u, v) in a raw image.
-            view: in which image.
+            view: in which image the pixel, the area or the laser's spot is.
             point: (x, y, z) instead of a pixel, m.
+            area: (u, v, u, v) of two opposite corners: at the clearest ridge between them.
+            laser: at the laser's spot in the newest image.
             thread: name; a thread that has it is looked for anew.
             timeout: seconds.
 
         Raises:
             Refused: there is no thread.
             Unavailable: nobody answers.
-            InputError: not exactly one place, or a bad name.
+            InputError: not exactly one place, or a bad name; nothing in the area; no laser's spot, or
+                several.
         """
+        if sum((pixel is not None, point is not None, area is not None, laser)) != 1:
+            raise InputError("give exactly one of a pixel, a point, an area and the laser")
+        if area is not None:
+            rig, field = self.calibration(), self._newest(topics.FIELD)
+            pixel = pixel_in_area(field, rig, area, right=view == "right")
+        elif laser:
+            frame = self._newest(topics.FRAME)
+            pixel = laser_spot(frame.right if view == "right" else frame.left)
         if view == "right" and pixel is not None and point is None:
             point = self._point_of_right(pixel)
             pixel = None
@@ -281,11 +296,7 @@ class Client:
     def _point_of_right(self, pixel: Pixel) -> Point:
         """The point in space, m, that a pixel of the raw right image means."""
         rig = self.calibration()
-        with self._lock:
-            self._fields = self._fields or self.bus.newest(topics.FIELD)
-        field = self._fields.get(_ARRIVAL_S)
-        if field is None:
-            raise Unavailable("no ridge fields come in which to look for the right pixel")
+        field = self._newest(topics.FIELD)
         try:
             at = rig.rectify_pixels(np.asarray(pixel, float), right=True)
             point = point_of_right_pixel(field, rig, at)
@@ -294,6 +305,18 @@ class Client:
             raise Refused(error.reason, tuple((float(u), float(v)) for u, v in near)) from error
         x, y, z = (point * rig.metres_per_unit).tolist()
         return x, y, z
+
+    def _newest(self, topic: Topic[T]) -> T:
+        """The next message of a topic; raises Unavailable."""
+        with self._lock:
+            if topic.key not in self._readers:
+                self._readers[topic.key] = self.bus.newest(topic)
+        message: T | None = self._readers[topic.key].get(_ARRIVAL_S)
+        if message is None:
+            raise Unavailable(
+                f"no {topic.key}s come in which to look; does a {topic.publisher} run?"
+            )
+        return message
 
     def _ask(self, question: Question[Q, A], content: Q, timeout: float) -> A:
         try:

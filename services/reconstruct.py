@@ -22,6 +22,7 @@ from suturetrack.initialization import (
     initialize,
 )
 from suturetrack.segmentation import SegmentationConfig, Segmenter
+from suturetrack.snapping import laser_spot, pixel_in_area
 from suturetrack.types import Image, InputError, Seed, Stamp, StereoFrame
 
 
@@ -41,10 +42,14 @@ class ReconstructConfig:
     _: KW_ONLY
     calibration: Path
     """Calibration of the rig."""
-    seed: tuple[float, float]
-    """U V: a pixel on the thread in the raw left image."""
     output: Path
     """The file to write."""
+    seed: tuple[float, float] | None = None
+    """U V: a pixel on the thread in the raw left image."""
+    area: tuple[float, float, float, float] | None = None
+    """U V U V of two opposite corners of a box instead: the clearest thread between them."""
+    laser: bool = False
+    """Instead, the bright spot of a laser in the left image."""
     layout: Literal["pair", "side-by-side"] = "pair"
     """Two images, or one whose left half is the left view."""
     unit: Literal["m", "mm"] | None = None
@@ -64,18 +69,33 @@ def run(config: ReconstructConfig) -> None:
         InputError: the images, the calibration or the seed are at fault, or no thread is found; no
             file is written.
     """
+    if sum((config.seed is not None, config.area is not None, config.laser)) != 1:
+        raise InputError("give exactly one of --seed U V, --area U V U V and --laser")
     left, right = _load(config)
     rig = open_rig(config.calibration, config.unit, config.scale, rectified=config.rectified)
     _check(left, right, rig)
     frame = StereoFrame(Stamp(0, 0, 0), left, right)
-    seed = Seed(pixel=config.seed)
     segmenter = Segmenter(rig, config.segmentation)
+    seed = Seed(pixel=_pixel(config, frame, segmenter, rig))
     segmenter.learn(frame, seed)
     try:
         found = initialize(segmenter.step(frame), rig, seed, config.initialization)
     except InitializationError as error:
         raise InputError(error.reason + _saturation(left, right)) from error
     _write(config.output, record(found))
+
+
+def _pixel(
+    config: ReconstructConfig, frame: StereoFrame, segmenter: Segmenter, rig: StereoRig
+) -> tuple[float, float]:
+    """The seed in the raw left image."""
+    if config.laser:
+        return laser_spot(frame.left)
+    if config.area is not None:
+        field = segmenter.step(frame)
+        return pixel_in_area(field, rig, config.area, config=config.initialization)
+    assert config.seed is not None
+    return config.seed
 
 
 def record(found: Initialization) -> dict[str, Any]:

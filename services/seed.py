@@ -19,9 +19,13 @@ class SeedConfig:
     pixel: Annotated[tuple[float, float] | None, tyro.conf.Positional] = None
     """U V of a pixel on the thread in a raw image."""
     view: Literal["left", "right"] = "left"
-    """In which image the pixel is."""
+    """In which image the pixel, the area or the laser's spot is."""
     point: tuple[float, float, float] | None = None
     """X Y Z of a point on the thread instead, in metres, in the rectified left camera."""
+    area: tuple[float, float, float, float] | None = None
+    """U V U V of two opposite corners of a box instead: the clearest thread between them."""
+    laser: bool = False
+    """Instead, the bright spot of a laser in the image."""
     thread: str = "0"
     """Name of the thread; one that has the name already is looked for anew."""
     rig: str = "rig"
@@ -34,12 +38,17 @@ def run(config: SeedConfig) -> None:
     """Seeds once.
 
     Raises:
-        InputError: no system runs, or there is no thread at that place.
+        InputError: not exactly one place, no system runs, or there is no thread at that place.
     """
     with connect(config.rig, config.zenoh) as client:
         try:
             found = client.seed(
-                config.pixel, view=config.view, point=config.point, thread=config.thread
+                config.pixel,
+                view=config.view,
+                point=config.point,
+                area=config.area,
+                laser=config.laser,
+                thread=config.thread,
             )
         except Refused as refusal:
             near = ", ".join(f"{u:.0f} {v:.0f}" for u, v in refusal.candidates)

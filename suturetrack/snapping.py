@@ -1,9 +1,11 @@
-"""From a rough place to the ridge that is meant: a click, a box, the tip of a tool."""
+"""From a rough place to the thread that is meant: a click, a box, a laser's spot, the tip of a tool."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from suturetrack import nurbs
@@ -11,7 +13,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationConfig, InitializationError, initialize
 from suturetrack.initialization.growth import nearest_segment
 from suturetrack.initialization.segments import find_ridges
-from suturetrack.types import Float32, Float64, Nurbs, RidgeField, Seed
+from suturetrack.types import Float32, Float64, Image, InputError, Nurbs, RidgeField, Seed
 
 _SAMPLES = 400
 _ROWS_PX = 1.0
@@ -19,6 +21,16 @@ _ROWS_PX = 1.0
 
 _SAME_PX = 3.0
 """How near to a curve a ridge is that belongs to it."""
+
+_WIDEST, _BREAK = 1 / 12, 1 / 80
+"""Of a laser's spot, its diameter and the dark thread that may part it, as shares of the image's height."""
+_CLIPPED, _LIFT, _CORE = 250, 96, 0.75
+"""Grey levels that a laser's spot reaches, those by which it is brighter than its surroundings, and the
+share of the largest such lift in the image from which on a pixel belongs to a spot."""
+_ROUND, _SMALLEST_PX2 = 0.5, 5
+"""Least share of the circle around it that a spot fills, and its least area."""
+_ALIKE = 0.5
+"""Two spots are alike when the weaker has more than this share of the other's strength."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +78,61 @@ def snap_area(view: Float32, corners: Float64, config: InitializationConfig) -> 
         if clear > most:
             best, most = Snap(inside[len(inside) // 2], segment), clear
     return best
+
+
+def pixel_in_area(
+    field: RidgeField,
+    rig: StereoRig,
+    area: tuple[float, float, float, float],
+    *,
+    right: bool = False,
+    config: InitializationConfig = InitializationConfig(),
+) -> tuple[float, float]:
+    """(u, v) of the clearest ridge within a box of a raw image, in that image.
+
+    Args:
+        field: both views.
+        rig: the cameras.
+        area: (u, v, u, v) of two opposite corners, pixels of the raw image.
+        right: whether that is the right image.
+        config: of the initialisation that the seed is for.
+
+    Raises:
+        InputError: there is none.
+    """
+    corners = rig.rectify_pixels(np.reshape(area, (2, 2)).astype(float), right=right)
+    found = snap_area(field.right if right else field.left, corners, config)
+    if found is None:
+        raise InputError(
+            "nothing in the area looks like thread; draw it around a part of the thread"
+        )
+    u, v = rig.raw_pixels(found.pixel, right=right).tolist()
+    return u, v
+
+
+def laser_spot(image: Image) -> tuple[float, float]:
+    """(u, v) of the middle of the one laser spot in a raw image.
+
+    A spot is small, round, clipped by the sensor in at least one channel, and far brighter than what
+    surrounds it. Seen on a dark thread, it may be parted by it.
+
+    Args:
+        image: (H, W, 3) BGR or (H, W) gray, uint8.
+
+    Raises:
+        InputError: there is no such spot, or another one is about as strong.
+    """
+    spots = sorted(_spots(image), reverse=True)
+    if not spots:
+        raise InputError("no laser spot in the image; point it at the thread, or dim the light")
+    alike = [spot.pixel for spot in spots if spot.strength > _ALIKE * spots[0].strength]
+    if len(alike) > 1:
+        places = ", ".join(f"{u:.0f} {v:.0f}" for u, v in alike[:5])
+        raise InputError(
+            f"{len(alike)} spots in the image may be the laser's: {places}; seed at one of them, or "
+            "dim the light"
+        )
+    return spots[0].pixel
 
 
 def snap_point(
@@ -143,6 +210,42 @@ def point_of_right_pixel(
     if best is None:
         raise InitializationError("the left view shows no thread that matches", np.empty((0, 2)))
     return best
+
+
+class _Spot(NamedTuple):
+    strength: float
+    pixel: tuple[float, float]
+
+
+def _spots(image: Image) -> list[_Spot]:
+    """Everything in an image that may be a laser's spot."""
+    smooth = cv2.GaussianBlur(image, (0, 0), 0.7)
+    lift = _brightest(cv2.morphologyEx(smooth, cv2.MORPH_TOPHAT, _disc(image, _WIDEST)))
+    lifted = (lift >= max(_LIFT, _CORE * int(lift.max()))).astype(np.uint8)
+    whole = cv2.morphologyEx(lifted, cv2.MORPH_CLOSE, _disc(image, _BREAK))
+    _, labels, boxes, centres = cv2.connectedComponentsWithStats(whole)
+    spots = []
+    for label in range(1, len(boxes)):
+        left, top, width, height, area = boxes[label].tolist()
+        box = slice(top, top + height), slice(left, left + width)
+        own = labels[box] == label
+        _, radius = cv2.minEnclosingCircle(np.argwhere(own).astype(np.float32))
+        is_round = area >= _ROUND * np.pi * (radius + 0.5) ** 2
+        is_clipped = _brightest(image[box])[own].max() >= _CLIPPED
+        if area >= _SMALLEST_PX2 and is_round and is_clipped:
+            u, v = centres[label].tolist()
+            spots.append(_Spot(float(lift[box][own].max()) * area**0.5, (u, v)))
+    return spots
+
+
+def _brightest(image: Image) -> Image:
+    """(H, W) the largest of the channels."""
+    return image if image.ndim == 2 else image.max(axis=2)
+
+
+def _disc(image: Image, share: float) -> Image:
+    size = 2 * round(share * image.shape[0] / 2) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)).astype(np.uint8)
 
 
 def _on_row(

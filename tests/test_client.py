@@ -6,7 +6,9 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from services.client import Client, Refused, Seen, Unavailable
 from services.memory_transport import Hub
 from services.messages import Forgotten, GraspReply, SeedReply
 from suturetrack import nurbs
+from suturetrack.camera import StereoRig
 from suturetrack.types import (
     Energies,
     Grasp,
@@ -24,9 +27,11 @@ from suturetrack.types import (
     Seed,
     Stamp,
     Status,
+    StereoFrame,
     ThreadState,
 )
 from tests.conftest import wait_until
+from tests.painting import paint, thread
 
 PERIOD_NS = 33_333_333
 
@@ -202,6 +207,56 @@ def test_seeds_are_answered_or_refused(stage: Stage, curve: Nurbs) -> None:
         stage.client.seed()
     with pytest.raises(InputError, match="thread 'a/b'"):
         stage.client.seed((1.0, 2.0), thread="a/b")
+
+
+def test_an_area_and_a_laser_spot_seed_at_a_pixel(stage: Stage, rig: StereoRig) -> None:
+    """What the newest field and the newest images show, in either view."""
+    line = thread(0.3)
+    field = paint(rig, [line], 0)
+    source, segmenter = (Bus(stage.hub.connect(), "rig", name) for name in ("source", "segmenter"))
+    source.answer(topics.CALIBRATION, lambda _: rig)
+    asked: list[Seed] = []
+    stage.tracker.answer(topics.SEED, lambda s: asked.append(s) or SeedReply(s.thread, True, ""))
+    for bus in (source, segmenter, stage.tracker):
+        bus.declare_alive()
+    images = [np.full((480, 640, 3), 90, np.uint8) for _ in range(2)]
+    cv2.circle(images[0], (320, 200), 5, (255, 255, 255), -1, cv2.LINE_AA)
+    frame = StereoFrame(field.stamp, *images)
+
+    def seed(**where: Any) -> Seed:
+        """While images and fields come, as they do."""
+        done = threading.Event()
+
+        def play() -> None:
+            while not done.wait(0.01):
+                source.publish(topics.FRAME, frame)
+                segmenter.publish(topics.FIELD, field)
+
+        player = threading.Thread(target=play)
+        player.start()
+        try:
+            stage.client.seed(**where)
+        finally:
+            done.set()
+            player.join()
+        return asked[-1]
+
+    left, right = (tuple(p[300]) for p in rig.project(line))
+    (u, v), (x, y) = left, right
+    assert seed(area=(u - 20, v - 20, u + 20, v + 20)).pixel == pytest.approx(left, abs=21)
+    point = seed(area=(x - 20, y - 20, x + 20, y + 20), view="right").point
+    assert np.linalg.norm(line - 1000 * np.array(point), axis=1).min() < 2
+    assert seed(laser=True).pixel == pytest.approx((320, 200), abs=0.5)
+    for wrong, where in (
+        ("nothing in the area", {"area": (0, 0, 20, 20)}),
+        ("no laser spot", {"laser": True, "view": "right"}),
+        ("exactly one", {"laser": True, "pixel": (1, 2)}),
+    ):
+        with pytest.raises(InputError, match=wrong):
+            seed(**where)
+    assert len(asked) == 3
+    source.close()
+    segmenter.close()
 
 
 def test_grasps_are_answered_or_refused(stage: Stage) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.metrics import curve_error
 from suturetrack.types import Image, InputError, Nurbs
 from tests.test_initialization import dense, draw
+from tests.test_snapping import GREEN, lit
 
 
 @pytest.fixture
@@ -74,6 +76,32 @@ def test_side_by_side_is_the_same(pair: tuple[Image, Image, ReconstructConfig]) 
     )
     run(other)
     assert other.output.read_text() == config.output.read_text()
+
+
+def test_an_area_and_a_laser_spot_give_the_same_curve(
+    pair: tuple[Image, Image, ReconstructConfig], rig: StereoRig, curve: Nurbs
+) -> None:
+    left, right, config = pair
+    assert config.seed is not None
+    u, v = config.seed
+    run(replace(config, seed=None, area=(u - 30, v - 20, u + 30, v + 40)))
+    assert curve_error(dense(curve_in(config.output)), dense(curve)).mean < 0.3
+    with pytest.raises(InputError, match="no laser spot"):
+        run(replace(config, seed=None, laser=True))
+    dimmed = [(image * 0.5).astype(np.uint8) for image in (left, right)]
+    places = (p[700] for p in rig.project(dense(curve)))
+    write(
+        config, *(lit(image, (p[0], p[1]), GREEN) for image, p in zip(dimmed, places, strict=True))
+    )
+    run(replace(config, seed=None, laser=True))
+    assert curve_error(dense(curve_in(config.output)), dense(curve)).mean < 0.3
+
+
+def test_a_seed_is_given_in_one_way(pair: tuple[Image, Image, ReconstructConfig]) -> None:
+    config = pair[2]
+    for wrong in (replace(config, seed=None), replace(config, laser=True)):
+        with pytest.raises(InputError, match="exactly one of --seed U V"):
+            run(wrong)
 
 
 def halved(image: Image) -> Image:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationConfig, InitializationError
-from suturetrack.snapping import point_of_right_pixel, snap_area, snap_pixel, snap_point
-from suturetrack.types import RidgeField
+from suturetrack.snapping import (
+    laser_spot,
+    pixel_in_area,
+    point_of_right_pixel,
+    snap_area,
+    snap_pixel,
+    snap_point,
+)
+from suturetrack.stage import Picture, open_scene
+from suturetrack.types import Image, InputError, RidgeField
 from tests.painting import paint, thread
 
 CONFIG = InitializationConfig()
@@ -98,3 +107,76 @@ def test_a_thread_in_the_right_view_alone_is_refused(rig: StereoRig) -> None:
     field = RidgeField(both.stamp, none.left, both.right)
     with pytest.raises(InitializationError, match="the left view shows no thread"):
         point_of_right_pixel(field, rig, rig.project(line)[1][300], CONFIG)
+
+
+def test_an_area_of_a_raw_image_gives_a_raw_pixel_on_the_thread(line: np.ndarray) -> None:
+    """A rig whose raw images are distorted."""
+    rig = open_scene("figure8-107", 0, picture=Picture(distortion=-0.2)).rig
+    line = line - line.mean(axis=0) + [0.0, 0.0, 300.0]
+    field = paint(rig, [line], 0)
+    for right, pixels in enumerate(rig.project_raw(line)):
+        (u, v), (x, y) = pixels[300] - 25, pixels[300] + 25
+        found = pixel_in_area(field, rig, (u, y, x, v), right=bool(right))
+        assert off(pixels, np.array(found)) < 0.6
+        assert abs(np.array(found) - pixels[300]).max() < 26
+    with pytest.raises(InputError, match="nothing in the area looks like thread"):
+        pixel_in_area(field, rig, (0, 0, 30, 30))
+
+
+RED, GREEN = (0.1, 0.15, 1.0), (0.15, 1.0, 0.1)
+
+
+def lit(
+    image: Image, at: tuple[float, float], colour: tuple[float, ...], power: float = 1500
+) -> Image:
+    """The image with a laser's spot, clipped in its core, with a halo; dark things reflect less."""
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    away = (u - at[0]) ** 2 + (v - at[1]) ** 2
+    light = power * (np.exp(-away / 8) + 0.06 * np.exp(-away / 128))
+    if image.ndim == 3:
+        light = light[..., None] * np.array(colour)
+    return np.clip(image + np.minimum(image / 160 + 0.1, 1) * light, 0, 255).astype(np.uint8)
+
+
+def table(colour: bool = True) -> Image:
+    """A rough gray ground with a dark thread, a bright wire, and a glossy plate."""
+    noise = np.random.default_rng(0).normal(110, 12, (480, 640))
+    image = cv2.GaussianBlur(noise, (0, 0), 1).astype(np.uint8)
+    cv2.line(image, (0, 100), (639, 380), 40, 4, cv2.LINE_AA)
+    cv2.line(image, (50, 470), (600, 430), 255, 3, cv2.LINE_AA)
+    cv2.rectangle(image, (20, 20), (160, 90), 255, -1)
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if colour else image
+
+
+@pytest.mark.parametrize("colour", [RED, GREEN, None])
+@pytest.mark.parametrize("at", [(250.3, 300.7), (320.0, 240.0), (600.0, 362.0), (5.0, 200.0)])
+def test_a_laser_spot_is_found_on_the_thread_and_beside_it(
+    colour: tuple[float, ...] | None, at: tuple[float, float]
+) -> None:
+    image = lit(table(colour is not None), at, colour or RED)
+    assert np.linalg.norm(np.subtract(laser_spot(image), at)) < 1.0
+
+
+def test_wires_plates_and_glossy_scenes_are_no_laser_spots() -> None:
+    with pytest.raises(InputError, match="no laser spot in the image"):
+        laser_spot(table())
+    for name in ("figure8-175", "clutter", "pull-through", "two-threads"):
+        with pytest.raises(InputError, match="laser"):
+            laser_spot(open_scene(name, 100).render(0)[0])
+
+
+@pytest.mark.parametrize(("name", "rig"), [("figure8-107", "bench"), ("figure8-175", "endoscope")])
+def test_a_laser_spot_is_found_on_a_rendered_thread(name: str, rig: str) -> None:
+    scene = open_scene(name, 101, rig)
+    left, at = scene.render(0)[0], scene.seed_pixel(0)
+    with pytest.raises(InputError, match="no laser spot in the image"):
+        laser_spot(left)
+    assert np.linalg.norm(np.subtract(laser_spot(lit(left, at, GREEN)), at)) < 1.5
+
+
+def test_of_two_spots_alike_neither_is_taken() -> None:
+    one = lit(table(), (250.0, 300.0), GREEN)
+    with pytest.raises(InputError, match=r"2 spots .*: (250 300, 420 80|420 80, 250 300); "):
+        laser_spot(lit(one, (420.0, 80.0), GREEN))
+    glint = lit(one, (420.0, 80.0), GREEN, power=200)
+    assert np.linalg.norm(np.subtract(laser_spot(glint), (250, 300))) < 1.0
