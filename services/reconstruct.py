@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from services.sources.exposure import exposure_fault
 from services.sources.footage import halves, read_image
 from services.sources.rig import check_size, open_rig
 from suturetrack import nurbs
@@ -81,7 +82,7 @@ def run(config: ReconstructConfig) -> None:
     try:
         found = initialize(segmenter.step(frame), rig, seed, config.initialization)
     except InitializationError as error:
-        raise InputError(error.reason + _saturation(left, right)) from error
+        raise InputError(error.reason) from error
     _write(config.output, record(found))
 
 
@@ -134,14 +135,9 @@ def _check(left: Image, right: Image, rig: StereoRig) -> None:
         )
     check_size((left.shape[1], left.shape[0]), rig, "the images", "the calibration")
     for name, image in (("left", left), ("right", right)):
-        if int(image.max()) == int(image.min()):
-            raise InputError(f"the {name} image is empty: every pixel is {int(image.max())}")
-
-
-def _saturation(left: Image, right: Image) -> str:
-    """What to add to a refusal where the images are overexposed."""
-    share = max(float((image == 255).mean()) for image in (left, right))
-    return f"; {share:.0%} of the pixels are saturated: lower the exposure" if share > 0.5 else ""
+        fault = exposure_fault(image)
+        if fault:
+            raise InputError(f"the {name} image is {fault}")
 
 
 def _size(image: Image) -> str:

@@ -14,6 +14,7 @@ from services import topics
 from services.bus import Reader
 from services.service import Service, ServiceConfig
 from services.sources import Footage, InputConfig, open_input
+from services.sources.exposure import ExposureWatch
 from services.sources.footage import Exposure, Stalled
 from services.sources.interlace import CombWatch
 from services.wire import scaled
@@ -59,17 +60,13 @@ def run(service: Service, config: SourceConfig) -> None:
     service.ready()
     if not footage.live and not bus.wait_for_alive("segmenter"):
         return
-    combs = CombWatch()
+    watch = _Watch(service)
     period_ns = 0 if config.service.lockstep else round(1e9 / footage.fps)
     pace = _Pace(service, footage, config.input.frames, _left_off(service))
     for index, exposure in pace:
         stamp = Stamp(index, exposure.capture_ns, _released_ns(footage, exposure), period_ns)
         frame = StereoFrame(stamp, exposure.left, exposure.right)
-        if combs.sees(exposure.left):
-            service.complain("the video seems interlaced: de-interlace it, thin threads comb")
-        if exposure.skipped:
-            service.meter.skipped += exposure.skipped
-            service.complain(f"{exposure.skipped} images left out: no partner within --slop-ms")
+        watch.look(exposure)
         truths = [dataclasses.replace(truth, stamp=stamp) for truth in exposure.truths]
         for truth in truths:
             bus.publish(topics.TRUTH, scaled(truth, rig.metres_per_unit))
@@ -88,6 +85,28 @@ def run(service: Service, config: SourceConfig) -> None:
     if pace.last is not None:
         _wait_for(steps, pace.last, _LAST_STEP_S)
     footage.close()
+
+
+class _Watch:
+    """Says what is wrong with the images; what lasts is in the health, too."""
+
+    def __init__(self, service: Service):
+        self._service = service
+        self._combs, self._exposures = CombWatch(), ExposureWatch()
+        self._fault = ""
+
+    def look(self, exposure: Exposure) -> None:
+        """To be called with every exposure."""
+        service, before = self._service, self._fault
+        self._fault = self._exposures.fault(exposure.left, exposure.right)
+        service.warning = self._fault
+        if self._fault and not before:
+            service.complain(self._fault)
+        if self._combs.sees(exposure.left):
+            service.complain("the video seems interlaced: de-interlace it, thin threads comb")
+        if exposure.skipped:
+            service.meter.skipped += exposure.skipped
+            service.complain(f"{exposure.skipped} images left out: no partner within --slop-ms")
 
 
 class _Pace:
@@ -127,13 +146,10 @@ class _Pace:
         """The frame with that number, whenever a stalled camera gives it; None at the end."""
         while not self._service.bus.stop.is_set:
             try:
-                exposure = self._footage.read(index)
+                return self._footage.read(index)
             except Stalled as stall:
                 self._service.warning = str(stall)
                 self._service.complain(str(stall))
-            else:
-                self._service.warning = ""
-                return exposure
         return None
 
     def _skip(self) -> None:

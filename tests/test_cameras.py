@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from pathlib import Path
@@ -181,6 +182,47 @@ def test_the_source_says_that_its_camera_stalls_and_goes_on(
     service.bus.stop.set()
     thread.join(20)
     assert not thread.is_alive()
+
+
+def test_the_source_says_what_is_wrong_with_the_exposure_for_as_long_as_it_is(
+    devices: Devices, calibration: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    good = both(1)
+    devices.images = {0: good}
+    config = SourceConfig(InputConfig("0", calibration))
+    service = Service("source", config.service, Bus(Hub().connect(), "rig", "source"))
+
+    def body() -> None:
+        with service:
+            source.run(service, config)
+
+    def warning() -> str:
+        return service.health().warning
+
+    thread = threading.Thread(target=body, daemon=True)
+    thread.start()
+    wait_until(lambda: service.meter.last is not None, 20)
+    assert not warning()
+    right = np.arange(2 * WIDTH) >= WIDTH
+    noise = np.random.default_rng(0).integers(0, 4, good.shape).astype(np.uint8)
+    for image, fault in (
+        (noise, "the left image is black: .*; the right image is black"),
+        (
+            np.where(right[:, None], np.uint8(90), good),
+            "^the right image is empty: every pixel is 90$",
+        ),
+        (
+            np.maximum(good, np.uint8(250)) | 4 | noise | 250,
+            "the left image is saturated: .* lower",
+        ),
+    ):
+        devices.images = {0: image}
+        wait_until(lambda fault=fault: re.search(fault, warning()))  # type: ignore[misc]
+    devices.images = {0: good}
+    wait_until(lambda: not warning())
+    service.bus.stop.set()
+    thread.join(20)
+    assert caplog.text.count("the left image is black") == 1
 
 
 def test_only_the_newest_exposure_waits() -> None:

@@ -116,6 +116,11 @@ def washed_out(image: Image) -> Image:
     return np.where(np.arange(len(image))[:, None] < 20, image, 255).astype(np.uint8)
 
 
+def without_thread(image: Image) -> Image:
+    noise = np.random.default_rng(0).normal(190, 2, image.shape)
+    return cv2.GaussianBlur(noise, (0, 0), 1).astype(np.uint8)
+
+
 @pytest.mark.parametrize(
     ("change_left", "change_right", "message"),
     [
@@ -125,7 +130,12 @@ def washed_out(image: Image) -> Image:
         (lambda i: i.astype(np.uint16) * 257, None, "uint16; convert it to 8 bit"),
         (lambda i: np.full_like(i, 90), None, "left image is empty"),
         (None, lambda i: np.full_like(i, 255), "right image is empty"),
-        (washed_out, None, "saturated"),
+        (washed_out, None, "left image is saturated: 9[0-9]% .*; lower the exposure"),
+        (lambda i: i // 25, None, "left image is black"),
+        (None, lambda i: i.astype(np.uint16) * 257, r"right.png is uint16; convert it to 8 bit"),
+        (None, coloured, "one image is gray"),
+        (None, without_thread, "right view shows no thread"),
+        (without_thread, None, "no thread within 8 px of the seed"),
         (None, lambda i: i[::-1], "right view"),
     ],
 )
@@ -143,6 +153,15 @@ def test_bad_images_are_refused(
     assert "\n" not in str(refusal.value)
     assert not config.output.exists()
     assert {p.suffix for p in config.output.parent.iterdir()} == {".png", ".yaml"}
+
+
+def test_a_thread_cut_out_on_white_is_not_saturated(
+    pair: tuple[Image, Image, ReconstructConfig], curve: Nurbs
+) -> None:
+    left, right, config = pair
+    write(config, *(np.where(image < 120, image, 255).astype(np.uint8) for image in (left, right)))
+    run(config)
+    assert curve_error(dense(curve_in(config.output)), dense(curve)).mean < 0.3
 
 
 def test_swapped_views_are_named(pair: tuple[Image, Image, ReconstructConfig]) -> None:
