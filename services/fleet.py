@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
+import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -12,10 +15,15 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import IO
+
+from services.pulse import Pulse
 
 _STOP_S = 5.0
+_POLL_S = 0.01
 _STOPPED = (-signal.SIGTERM,)
 """Statuses of a process that was stopped before it could say goodbye."""
+_SET_CHILD_SUBREAPER = 36
 _MEMORY_S = 60.0
 """Deaths longer ago count neither towards the budget nor for the back-off."""
 _BACK_OFF_S = 0.5
@@ -30,46 +38,74 @@ class Launch:
     arguments: tuple[str, ...]
 
 
-class Spare:
-    """A process that has all loaded and waits to be told which one it is; see `services.spare`."""
+class Nursery:
+    """The process from which all others are forked; another takes its place when it has died.
+
+    Each is told its arguments and a pipe for what it says, on whose first line it tells its process id;
+    see `services.nursery`.
+    """
 
     def __init__(self) -> None:
-        self._process = _start("services.spare", stdin=subprocess.PIPE)
+        # Makes the forked ones children of this process.
+        ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        self._begin()
 
-    def become(self, launch: Launch) -> subprocess.Popen[str]:
-        """The process, on its way; a fresh one where the spare has died itself."""
-        assert self._process.stdin is not None
-        with suppress(BrokenPipeError), self._process.stdin as told:
-            told.write(json.dumps([launch.name, *launch.arguments]) + "\n")
-            told.flush()
-            if self._process.poll() is None:
-                return self._process
-        return _start("services.cli", launch.name, *launch.arguments)
+    def bear(self, launch: Launch) -> IO[str]:
+        """Has a process started; what it says."""
+        request = json.dumps([launch.name, *launch.arguments]).encode()
+        said, told = os.pipe()
+        if self._process.poll() is not None:
+            self._desk.close()
+            self._begin()
+        # Should it have died since, the pipe closes, which is how any stillborn process is noticed.
+        with suppress(BrokenPipeError):
+            socket.send_fds(self._desk, [request], [told])
+        os.close(told)
+        return os.fdopen(said, errors="replace")
 
     def stop(self) -> None:
-        """Ends it, when it became nobody."""
-        assert self._process.stdin is not None
-        if not self._process.stdin.closed:
-            self._process.kill()
-            self._process.communicate()
+        """Ends it; what it has not begun yet will not begin."""
+        self._desk.close()
+        self._process.kill()
+        self._process.wait()
+
+    def _begin(self) -> None:
+        self._desk, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        # A session of its own keeps Ctrl-C for the launcher, which stops all in order.
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "services.nursery"],
+                stdin=theirs.fileno(),
+                stdout=subprocess.DEVNULL,
+                start_new_session=True,
+            )
 
 
 class Child:
-    """A running process and the last that it said."""
+    """A forked process and the last that it said."""
 
-    def __init__(self, name: str, process: subprocess.Popen[str], say: Callable[[str], None]):
+    def __init__(self, name: str, said: IO[str], say: Callable[[str], None]):
         self.name = name
-        self._process = process
+        self._pid: int | None = None
+        self._status: int | None = None
+        self._hung = ""
         self._say = say
         self._prefix = f"suturetrack {name}: "
         self._last: deque[str] = deque(maxlen=30)
-        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener = threading.Thread(target=self._listen, args=(said,), daemon=True)
         self._listener.start()
 
     @property
     def status(self) -> int | None:
-        """Exit status; negative for a signal; None while it runs."""
-        return self._process.poll()
+        """Exit status; negative for a signal; None while it runs or is about to."""
+        silent = not self._listener.is_alive()
+        if self._status is None and self._pid is not None:
+            pid, status = os.waitpid(self._pid, os.WNOHANG)
+            self._status = os.waitstatus_to_exitcode(status) if pid else None
+        elif self._status is None and silent:
+            self._last.append("it could not be started")
+            self._status = 1
+        return self._status
 
     @property
     def was_refused(self) -> bool:
@@ -83,27 +119,41 @@ class Child:
         last = self._final_line()
         if last.startswith(self._prefix):
             return last.removeprefix(self._prefix)
+        if self._hung:
+            return f"the {self.name} hung and was killed: {self._hung}"
         status = self.status or 0
         how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
         return f"the {self.name} {how}{': ' + last if last and status > 0 else ''}"
 
+    def end(self, reason: str) -> None:
+        """Kills a process that hangs."""
+        self._hung = reason
+        self._signal(signal.SIGKILL)
+
     def stop(self) -> None:
         """SIGTERM, and SIGKILL when that does not help."""
-        if self.status is None:
-            self._process.terminate()
-            try:
-                self._process.wait(_STOP_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+        deadline = time.monotonic() + _STOP_S
+        told = False
+        while self.status is None:
+            told = told or self._signal(signal.SIGTERM)
+            if time.monotonic() > deadline:
+                self._signal(signal.SIGKILL)
+            time.sleep(_POLL_S)
         self._listener.join(_STOP_S)
+
+    def _signal(self, number: signal.Signals) -> bool:
+        if self._pid is None or self.status is not None:
+            return False
+        os.kill(self._pid, number)
+        return True
 
     def _final_line(self) -> str:
         return self._last[-1] if self._last else ""
 
-    def _listen(self) -> None:
-        assert self._process.stderr is not None
-        with self._process.stderr as lines:
+    def _listen(self, said: IO[str]) -> None:
+        with said as lines:
+            first = lines.readline()
+            self._pid = int(first) if first else None
             for line in lines:
                 self._last.append(line.rstrip())
                 if not line.startswith(self._prefix):
@@ -113,12 +163,13 @@ class Child:
 class Post:
     """One place in the fleet, and who holds it."""
 
-    def __init__(self, launch: Launch, say: Callable[[str], None]):
-        self._launch, self._say = launch, say
+    def __init__(self, launch: Launch, nursery: Nursery, say: Callable[[str], None]):
+        self._launch, self._nursery, self._say = launch, nursery, say
         self._deaths: deque[float] = deque()
-        self._starts = 0
         self._due: float | None = None
-        self.child = Child(launch.name, _start("services.cli", launch.name, *launch.arguments), say)
+        self.starts = 0
+        """How often the process was started again."""
+        self.child = Child(launch.name, nursery.bear(launch), say)
 
     @property
     def is_vacant(self) -> bool:
@@ -142,16 +193,15 @@ class Post:
         )
         return True
 
-    def refill(self, spare: Spare) -> bool:
-        """Starts the process again when it is due; whether the spare was used."""
+    def refill(self) -> None:
+        """Starts the process again when it is due."""
         if self._due is None or time.monotonic() < self._due:
-            return False
+            return
         self._due = None
-        self._starts += 1
-        resume = ("--resume", str(self._starts))
+        self.starts += 1
+        resume = ("--resume", str(self.starts))
         launch = Launch(self._launch.name, (*self._launch.arguments, *resume))
-        self.child = Child(launch.name, spare.become(launch), self._say)
-        return True
+        self.child = Child(launch.name, self._nursery.bear(launch), self._say)
 
 
 class Fleet:
@@ -161,32 +211,30 @@ class Fleet:
         launches: what to start.
         say: told what a person should know, line by line.
         budget: how often each process is started again within a minute; 0 is never.
+        pulse: tells which processes hang.
     """
 
-    def __init__(self, launches: list[Launch], say: Callable[[str], None], budget: int):
-        self._say, self._budget = say, budget
-        self._posts: list[Post] = []
+    def __init__(
+        self, launches: list[Launch], say: Callable[[str], None], budget: int, pulse: Pulse
+    ):
+        self._budget, self._pulse = budget, pulse
+        self._nursery = Nursery()
         self._failed: Post | None = None
-        self._spare: Spare | None = None
-        try:
-            for launch in reversed(launches):
-                self._posts.insert(0, Post(launch, say))
-            self._spare = Spare() if budget else None
-        except BaseException:
-            self.stop()
-            raise
+        posts = [Post(launch, self._nursery, say) for launch in reversed(launches)]
+        self._posts = posts[::-1]
 
     def tend(self) -> bool:
         """Starts again what has died; False when the run is over, well or not."""
-        for post in self._posts:
-            if post.is_vacant:
-                self._refill(post)
-            elif post.child.status is not None and not self._bury(post):
-                return False
-        return True
+        self._pulse.look()
+        # All are looked at before the run is called over: who ends well hides nobody's death.
+        held = [self._tend(post) for post in self._posts]
+        return all(held)
 
     def complaint(self) -> str | None:
         """Why the run failed; None when every process ended as it should."""
+        for post in self._posts:
+            if post.is_vacant:
+                return f"{post.child.complaint()}; the run ended before it was started again"
         if self._failed is None:
             return None
         complaint = self._failed.child.complaint()
@@ -198,23 +246,30 @@ class Fleet:
 
     def stop(self) -> None:
         """Stops all that still run."""
-        if self._spare is not None:
-            self._spare.stop()
+        self._nursery.stop()
         for post in self._posts:
             post.child.stop()
+
+    def _tend(self, post: Post) -> bool:
+        """Whether there is still somebody to do the work of a post, now or soon."""
+        if post.is_vacant:
+            post.refill()
+            return True
+        if post.child.status is None:
+            trouble = self._pulse.trouble(post.child.name, post.starts)
+            if trouble:
+                post.child.end(trouble)
+            return True
+        return self._bury(post)
 
     def _bury(self, post: Post) -> bool:
         if post.child.status in (0, *_STOPPED):
             return False
         if not post.child.was_refused and self._budget and post.bury(self._budget):
-            self._refill(post)
+            post.refill()
             return True
         self._failed = post
         return False
-
-    def _refill(self, post: Post) -> None:
-        if self._spare is not None and post.refill(self._spare):
-            self._spare = Spare()
 
 
 def _back_off(deaths: int) -> float:
@@ -222,16 +277,3 @@ def _back_off(deaths: int) -> float:
     if deaths == 0:
         return 0.0
     return min(_BACK_OFF_S * 2.0 ** (deaths - 1), _LONGEST_BACK_OFF_S)
-
-
-def _start(*module: str, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
-    # A session of its own keeps Ctrl-C for the launcher, which stops all in order.
-    return subprocess.Popen(
-        [sys.executable, "-m", *module],
-        stdin=stdin,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        errors="replace",
-        start_new_session=True,
-    )

@@ -194,7 +194,7 @@ def _watch(config: RunConfig, console: Console, stack: ExitStack) -> Monitor:
     monitor = Monitor(bus)
     budget = 0 if service.lockstep else config.restarts
     say = partial(console.print, markup=False, soft_wrap=True)
-    fleet = Fleet(_launches(config), say, budget)
+    fleet = Fleet(_launches(config), say, budget, monitor.pulse)
     if config.view:
         stack.callback(_show(service).terminate)
     try:

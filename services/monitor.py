@@ -11,6 +11,7 @@ from rich.table import Table
 from services import topics
 from services.bus import Bus
 from services.messages import Health
+from services.pulse import Pulse
 from suturetrack.types import Status, ThreadState, Truth
 
 _STALE_S = 3.0
@@ -30,6 +31,7 @@ class Monitor:
     """Listens to states, truths and heartbeats of a rig."""
 
     def __init__(self, bus: Bus):
+        self.pulse = Pulse()
         self._states = bus.every(topics.STATE)
         self._truths = bus.every(topics.TRUTH)
         self._healths = bus.every(topics.HEALTH)
@@ -45,6 +47,7 @@ class Monitor:
             self._take_state(state)
         while (health := self._healths.get(0)) is not None:
             self._health[health.process] = health
+            self.pulse.hear(health)
 
     def line(self) -> str:
         """The run at a glance."""

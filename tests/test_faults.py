@@ -60,7 +60,6 @@ def direction(seen: Seen | None) -> np.ndarray:
 
 def kill(system: System, process: str) -> float:
     """Kills a process and waits until another has its place; the wall clock of the death."""
-    system.until_prepared()
     pid = system.pid(process)
     assert pid is not None
     died = time.time()
@@ -98,19 +97,37 @@ def test_a_process_that_dies_is_replaced_and_the_thread_is_regained(
     assert f"the {process} was killed by signal 9; it is started again" in system.said
 
 
-def test_without_a_spare_a_process_is_started_afresh(system: System) -> None:
-    def spares() -> list[psutil.Process]:
-        found = psutil.Process(system.launcher).children()
-        return [child for child in found if child.name() not in ROLES]
+def nursery(system: System) -> psutil.Process | None:
+    found = psutil.Process(system.launcher).children()
+    return next((child for child in found if child.name() == "nursery"), None)
 
-    system.until(spares)
-    pid = system.pid("tracker")
+
+def test_a_death_right_after_another_is_made_good_as_soon(system: System) -> None:
+    kill(system, "tracker")
+    system.until(lambda: system.pid("tracker"))
+    kill(system, "tracker")
+    # What is waited for begins after the back-off, at the new start.
+    assert system.until_tracking() < 2.0
+
+
+def test_without_the_nursery_a_process_is_started_all_the_same(system: System) -> None:
+    pid, dead = system.pid("tracker"), nursery(system)
     assert pid is not None
-    for spare in spares():
-        spare.kill()
+    assert dead is not None
+    dead.kill()
     os.kill(pid, signal.SIGKILL)
     system.until(lambda: system.pid("tracker") not in (None, pid))
     system.until_tracking()
+    assert nursery(system) not in (None, dead)
+
+
+def test_a_process_that_hangs_is_ended_and_started_again(system: System) -> None:
+    pid = system.pid("segmenter")
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
+    system.until(lambda: system.pid("segmenter") not in (None, pid))
+    system.until_tracking()
+    assert "the segmenter hung and was killed: nothing was heard of it for 5 s" in system.said
 
 
 @pytest.fixture

@@ -58,7 +58,7 @@ def sockets() -> list[Path]:
 
 
 def children(process: subprocess.Popen[str]) -> dict[str, psutil.Process]:
-    """The processes that a launcher has started, by name; the spare one has none yet."""
+    """The processes that a launcher has started, by name; the nursery is none of them."""
     found = {child.name(): child for child in psutil.Process(process.pid).children()}
     return {name: child for name, child in found.items() if name in PROCESSES}
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import os
 import random
 import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -48,6 +49,8 @@ class FaultsBench:
     """Frames a second."""
     seed: int = 0
     """Of the moments of the injections."""
+    results: Path | None = None
+    """File to which every injection is added as it is done; those that it holds are not done again."""
 
 
 @dataclass(frozen=True)
@@ -78,26 +81,59 @@ class Measured:
     missed: int = 0
     back_s: list[float] = field(default_factory=list)
 
+    def add(self, other: Measured) -> None:
+        """Takes in further injections."""
+        self.stale_ms += other.stale_ms
+        self.missed += other.missed
+        self.back_s += other.back_s
+
 
 def run(config: FaultsBench, console: Console) -> list[Row]:
     """Prints a row for each kind of fault and process."""
     cases = [(kind, process) for kind in config.kinds for process in config.processes]
-    chance = random.Random(config.seed)
-    table = []
+    results = {case: Measured() for case in cases}
+    for kind, process, measured in _read(config.results):
+        if (kind, process) in results:
+            results[kind, process].add(measured)
+    chance = random.Random(config.seed + sum(len(m.stale_ms) for m in results.values()))
+    todo = [case for case in cases for _ in range(config.repeats - len(results[case].stale_ms))]
+    chance.shuffle(todo)
+    if todo:
+        for case, measured in _injections(config, console, todo, chance):
+            results[case].add(measured)
+            _write(config.results, *case, measured)
+    table = [_row(*case, measured, config.fps) for case, measured in results.items()]
+    report.print_rows(console, "Faults, as a consumer sees them", table)
+    return table
+
+
+def _injections(
+    config: FaultsBench, console: Console, cases: list[tuple[Kind, str]], chance: random.Random
+) -> Iterator[tuple[tuple[Kind, str], Measured]]:
+    """Injects one fault after the other into one system."""
     with private_folder() as folder, Progress(console=console, transient=True) as progress:
-        task = progress.add_task("Faults", total=len(cases) * config.repeats)
         options = film(Path(folder) / "film", _FRAMES, config.fps)
         options += ["--restarts", "1000000"]
         with System(rig_name("faults"), options, Path(folder)) as system:
             system.until_tracking()
-            for kind, process in cases:
+            for kind, process in progress.track(cases, description="Faults"):
                 measured = Measured()
-                for _ in range(config.repeats):
-                    inject(system, kind, process, measured, config.fps, chance)
-                    progress.advance(task)
-                table.append(_row(kind, process, measured, config.fps))
-    report.print_rows(console, "Faults, as a consumer sees them", table)
-    return table
+                inject(system, kind, process, measured, config.fps, chance)
+                yield (kind, process), measured
+
+
+def _read(path: Path | None) -> Iterator[tuple[str, str, Measured]]:
+    if path is None or not path.exists():
+        return
+    for line in path.read_text().splitlines():
+        fields = json.loads(line)
+        yield fields.pop("kind"), fields.pop("process"), Measured(**fields)
+
+
+def _write(path: Path | None, kind: str, process: str, measured: Measured) -> None:
+    if path is not None:
+        with path.open("a") as file:
+            file.write(json.dumps({"kind": kind, "process": process, **asdict(measured)}) + "\n")
 
 
 def inject(
@@ -110,8 +146,6 @@ def inject(
 ) -> None:
     """One fault at a random moment, until the consumer has a live view of a tracked thread again."""
     _idle(system, chance.uniform(0.2, 0.5))
-    if kind == "killed":
-        system.until_prepared()
     pid = system.pid(process)
     assert pid is not None
     with _faulty(kind, pid):

@@ -155,7 +155,6 @@ def measure(load: str, fps: float, seconds: float, options: list[str], folder: P
     with System(rig, [*options, "--fps", f"{fps:g}"], folder) as system:
         # No state is ever live where frames come faster than states can.
         system.until(lambda: system.client.latest() is not None)
-        system.until_prepared()
         slow = _slow_consumers(rig) if load.endswith(BESIDE) else []
         try:
             watch = _Watch(system)

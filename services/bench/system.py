@@ -23,7 +23,6 @@ from suturetrack.stage import open_scene
 from suturetrack.types import InputError, Status
 
 ROLES = ("source", "segmenter", "tracker")
-SPARE = "spare"
 START_S = 60.0
 _POLL_S = 0.0005
 
@@ -74,17 +73,12 @@ class System:
 
     def processes(self) -> dict[str, psutil.Process]:
         """The processes of the dataflow that run now, by name."""
-        found = named(psutil.Process(self.launcher))
-        return {name: process for name, process in found.items() if name in ROLES}
+        return named(psutil.Process(self.launcher))
 
     def pid(self, process: str) -> int | None:
         """Process id of one of them; None while it is dead."""
         found = self.processes().get(process)
         return None if found is None else found.pid
-
-    def until_prepared(self) -> None:
-        """Waits for a process in waiting, which takes the next dead one's place."""
-        self.until(lambda: SPARE in named(psutil.Process(self.launcher)))
 
     def until(self, condition: Callable[[], object], seconds: float = START_S) -> float:
         """Waits for a condition; the seconds it took. Raises InputError when it never comes true."""
@@ -122,11 +116,11 @@ def is_tracking(seen: Seen | None) -> bool:
 
 
 def named(parent: psutil.Process) -> dict[str, psutil.Process]:
-    """The processes of the dataflow and the spare among the children of a process, by name."""
+    """The processes of the dataflow among the children of a process, by name."""
     found = {}
     for child in parent.children():
         with suppress(psutil.NoSuchProcess):
-            if child.name() in (*ROLES, SPARE) and child.status() != psutil.STATUS_ZOMBIE:
+            if child.name() in ROLES and child.status() != psutil.STATUS_ZOMBIE:
                 found[child.name()] = child
     return found
 

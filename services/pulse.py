@@ -1,0 +1,76 @@
+"""Which processes hang, by their heartbeats: a process that hangs neither ends nor loses its token."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from services.messages import Health
+
+_SILENT_S = 5.0
+"""Without a heartbeat until a process counts as hung."""
+_STILL = 10
+"""Heartbeats, thus seconds, without a frame until a process counts as hung, while there are frames."""
+_PAUSE_S = 1.0
+"""Between two looks until it was the one who looks that stood still."""
+_FEEDS = {"segmenter": "source", "tracker": "segmenter"}
+"""From which process each one's input comes."""
+
+
+@dataclass
+class _Beat:
+    """What was heard of a process last."""
+
+    health: Health
+    at: float
+    still: int = 0
+    """Heartbeats since its last frame at which there would have been frames."""
+
+
+class Pulse:
+    """Judges the heartbeats of a run; to be looked at several times a second."""
+
+    def __init__(self) -> None:
+        self._beats: dict[str, _Beat] = {}
+        self._looked = 0.0
+
+    def hear(self, health: Health, now: float | None = None) -> None:
+        """Takes in a heartbeat."""
+        now = time.monotonic() if now is None else now
+        name, last = health.process, self._beats.get(health.process)
+        if last is None or last.health.restarts != health.restarts:
+            self._beats[name] = _Beat(health, now)
+            return
+        moved = _progress(health) != _progress(last.health)
+        for other, feed in _FEEDS.items():
+            if moved and feed == name and other in self._beats:
+                self._beats[other].still += 1
+        waits = name in _FEEDS or health.warning or not health.stamp or not health.stamp.period_ns
+        still = 0 if moved else last.still + (not waits)
+        self._beats[name] = _Beat(health, now, still)
+
+    def look(self, now: float | None = None) -> None:
+        """Forgives everyone where the one who looks stood still itself."""
+        now = time.monotonic() if now is None else now
+        if now - self._looked > _PAUSE_S:
+            for beat in self._beats.values():
+                beat.at, beat.still = now, 0
+        self._looked = now
+
+    def trouble(self, process: str, starts: int) -> str:
+        """Why a process that was started again so many times counts as hung; empty when it does not."""
+        beat = self._beats.get(process)
+        if beat is None or beat.health.restarts != starts:
+            return ""
+        silent_s = self._looked - beat.at
+        if silent_s > _SILENT_S:
+            return f"nothing was heard of it for {silent_s:.0f} s"
+        stamp = beat.health.stamp
+        period_s = stamp.period_ns / 1e9 if stamp else 0.0
+        if beat.still > max(_STILL, _STILL * period_s):
+            return f"it finished no frame for {beat.still} s"
+        return ""
+
+
+def _progress(health: Health) -> tuple[int, int]:
+    return health.frames, health.refused
