@@ -36,6 +36,8 @@ class Monitor:
         self._truths = bus.every(topics.TRUTH)
         self._healths = bus.every(topics.HEALTH)
         self._health: dict[str, Health] = {}
+        self._lives: dict[tuple[str, int], Health] = {}
+        """The last heartbeat of each life of each process: counts begin anew with a new one."""
         self._threads: dict[str, _Thread] = {}
         self._true_mm: dict[str, float] = {}
 
@@ -47,6 +49,7 @@ class Monitor:
             self._take_state(state)
         while (health := self._healths.get(0)) is not None:
             self._health[health.process] = health
+            self._lives[health.process, health.restarts] = health
             self.pulse.hear(health)
 
     def line(self) -> str:
@@ -59,7 +62,7 @@ class Monitor:
         tracker = self._health.get("tracker")
         if tracker is not None:
             parts.append(f"latency {tracker.latency.p50_ms:.0f}/{tracker.latency.p99_ms:.0f} ms")
-        parts.append(f"dropped {sum(h.dropped for h in self._health.values())}")
+        parts.append(f"dropped {sum(h.dropped for h in self._lives.values())}")
         for name, thread in self._threads.items():
             length = thread.last.length * 1000
             known = "" if np.isnan(length) else f" {length:.1f} mm"
@@ -89,10 +92,13 @@ class Monitor:
         names = sorted(self._health, key=lambda n: (order.index(n) if n in order else 9, n))
         return [(name, self._health[name]) for name in names]
 
+    def _total(self, process: str, count: str) -> int:
+        """Of all lives of a process."""
+        return sum(getattr(h, count) for (name, _), h in self._lives.items() if name == process)
+
     def _frames(self) -> int:
-        source = self._health.get("source")
         seen = max((sum(t.statuses.values()) for t in self._threads.values()), default=0)
-        return max(seen, 0 if source is None else source.frames + source.dropped)
+        return max(seen, self._total("source", "frames") + self._total("source", "dropped"))
 
     def _thread_table(self) -> Table:
         table = Table(title=f"Threads, of {self._frames()} frames", title_justify="left")
@@ -120,11 +126,11 @@ class Monitor:
             latency = health.run_latency
             table.add_row(
                 name,
-                str(health.frames),
+                str(self._total(name, "frames")),
                 f"{health.run_rate_hz:.2f}",
                 *(f"{ms:.1f}" for ms in (latency.p50_ms, latency.p99_ms, latency.max_ms)),
-                str(health.dropped),
-                str(health.refused),
+                str(self._total(name, "dropped")),
+                str(self._total(name, "refused")),
                 f"{health.memory_mb:.0f}",
             )
         return table

@@ -45,6 +45,7 @@ def _load() -> None:
     import numpy as np
 
     from services import segmenter, source, tracker
+    from services.service import compiling
     from suturetrack.camera import StereoRig
 
     del source
@@ -52,8 +53,9 @@ def _load() -> None:
     rig = StereoRig.from_calibration(
         (640, 480), camera, camera, np.eye(3), np.array([-0.04, 0, 0]), 1.0
     )
-    segmenter.warm_up(rig, segmenter.SegmenterConfig())
-    tracker.warm_up(rig, tracker.TrackerConfig())
+    with compiling():
+        segmenter.warm_up(rig, segmenter.SegmenterConfig())
+        tracker.warm_up(rig, tracker.TrackerConfig())
     # What is there now stays, and its pages stay shared.
     gc.collect()
     gc.freeze()

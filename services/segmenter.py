@@ -12,7 +12,7 @@ import tyro
 from services import topics
 from services.adaptation import Adaptation
 from services.bus import Bus
-from services.service import Service, ServiceConfig, Stopped
+from services.service import Service, ServiceConfig, Stopped, compiling
 from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
@@ -47,8 +47,10 @@ def run(service: Service, config: SegmenterConfig) -> None:
     bus = service.bus
     rig = service.calibrated_rig()
     segmenter = Segmenter(rig, config.segmentation)
-    segmenter.warm_up()
-    bus.make_room(warm_up(rig, config))
+    with compiling():
+        segmenter.warm_up()
+        example = warm_up(rig, config)
+    bus.make_room(example)
     recorder = service.record(rig, config)
     seedings, drops = bus.every(topics.SEEDING), bus.every(topics.DROPPED)
     states = bus.every(topics.STATE)

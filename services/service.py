@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import fcntl
 import logging
 import os
 import signal
@@ -25,6 +26,7 @@ from services.messages import Health
 from services.meter import Meter
 from services.recording import Recorder
 from services.zenoh_transport import ZenohTransport, load_config, local_config
+from suturetrack import kernels
 from suturetrack.camera import StereoRig
 from suturetrack.types import InputError, Stamp
 
@@ -165,6 +167,20 @@ class Service:
             health = self.health()
             self.bus.publish(topics.HEALTH, health)
             self._unrecorded.append(health)
+
+
+@contextmanager
+def compiling() -> Iterator[None]:
+    """Has one process of this machine at a time compile kernels, or load them.
+
+    Processes that fill numba's cache side by side each do all the work, and some have died of it.
+    """
+    folder = os.open(Path(kernels.__file__).parent, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)
 
 
 def run(name: str, config: ServiceConfig, body: Callable[[Service], None]) -> None:

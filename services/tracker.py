@@ -14,7 +14,7 @@ from services import topics
 from services.gate import Gate
 from services.grasping import GraspDesk
 from services.seeding import SeedDesk
-from services.service import Service, ServiceConfig, Stopped
+from services.service import Service, ServiceConfig, Stopped, compiling
 from services.wire import scaled
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationConfig
@@ -41,7 +41,8 @@ def run(service: Service, config: TrackerConfig) -> None:
     tracker = Tracker(rig, config.tracking, config.initialization)
     desk = SeedDesk(bus, tracker, rig, config.tracking.patience, at_once=config.service.lockstep)
     grasps = GraspDesk(bus, rig)
-    warm_up(rig, config)
+    with compiling():
+        warm_up(rig, config)
     given = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
     if config.service.resume:
         desk.resume(given)

@@ -122,7 +122,7 @@ def _injections(
                 yield (kind, process), measured
 
 
-def _read(path: Path | None) -> Iterator[tuple[str, str, Measured]]:
+def _read(path: Path | None) -> Iterator[tuple[Kind, str, Measured]]:
     if path is None or not path.exists():
         return
     for line in path.read_text().splitlines():
@@ -130,7 +130,7 @@ def _read(path: Path | None) -> Iterator[tuple[str, str, Measured]]:
         yield fields.pop("kind"), fields.pop("process"), Measured(**fields)
 
 
-def _write(path: Path | None, kind: str, process: str, measured: Measured) -> None:
+def _write(path: Path | None, kind: Kind, process: str, measured: Measured) -> None:
     if path is not None:
         with path.open("a") as file:
             file.write(json.dumps({"kind": kind, "process": process, **asdict(measured)}) + "\n")

@@ -23,7 +23,8 @@ from suturetrack.stage import open_scene
 from suturetrack.types import InputError, Status
 
 ROLES = ("source", "segmenter", "tracker")
-START_S = 60.0
+START_S = 180.0
+"""A first start compiles the kernels."""
 _POLL_S = 0.0005
 
 
