@@ -89,6 +89,50 @@ def coverage(estimate: Float64, truth: Float64, radius: float) -> float:
     return float((polyline_distances(truth, estimate) <= radius).mean())
 
 
+def in_order(estimate: Float64, truth: Float64, radius: float, samples: int = 300) -> float:
+    """Share of the truth that is within `radius` of the curve when both are walked from end to end.
+
+    The walks are those of dynamic time warping, in the direction that fits better: each goes on or
+    waits, and none turns back. Strands in the wrong order are near a curve and yet not in order.
+
+    Args:
+        estimate: (k, dim) ordered points of the curve.
+        truth: (m, dim) ordered points of the true one.
+        radius: unit of the points.
+        samples: as many places are compared, evenly spaced along each.
+    """
+    walked = [resample(points, samples) for points in (estimate, truth)]
+    distances = np.linalg.norm(walked[0][:, None] - walked[1], axis=2)
+    ways = [_warped(d) for d in (distances, distances[::-1])]
+    return float((min(ways, key=lambda way: float(way.sum())) <= radius).mean())
+
+
+def resample(points: Float64, count: int) -> Float64:
+    """(count, dim) points evenly spaced along the polyline through (k, dim) points."""
+    travelled = _travelled(points)
+    samples = np.linspace(0, travelled[-1], count)
+    return np.stack([np.interp(samples, travelled, column) for column in points.T], axis=1)
+
+
+def _warped(distances: Float64) -> Float64:
+    """(m,) largest distance at which each column is met on the cheapest monotone way, (k, m) given."""
+    cost = np.empty_like(distances)
+    cost[0] = np.cumsum(distances[0])
+    for i in range(1, len(cost)):
+        # A row is entered from above or diagonally at one column and walked to another.
+        entered = np.minimum(cost[i - 1], np.r_[np.inf, cost[i - 1, :-1]])
+        run = np.cumsum(distances[i])
+        cost[i] = run + np.minimum.accumulate(entered - np.r_[0.0, run[:-1]])
+    i, j = np.array(cost.shape) - 1
+    met = np.zeros(distances.shape[1])
+    while True:
+        met[j] = max(met[j], distances[i, j])
+        if i == j == 0:
+            return met
+        steps = [(a, b) for a, b in ((i - 1, j - 1), (i - 1, j), (i, j - 1)) if a >= 0 and b >= 0]
+        i, j = min(steps, key=lambda step: float(cost[step]))
+
+
 def physical_limit(
     rig: StereoRig, points: Float64, noise_px: float = 0.05, knot_spacing_px: float = 16.0
 ) -> float:

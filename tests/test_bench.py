@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from services.bench import report
+from services.bench import report, segmentation
 from services.bench.initialization import InitializationBench
 from services.bench.initialization import rows as initialization_rows
+from services.bench.segmentation import SegmentationBench
 from services.bench.tracking import Case, FrameScore, TrackingBench, score, summarise
 from services.bench.tracking import rows as tracking_rows
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
+from suturetrack.stage import Picture
 from suturetrack.types import Energies, InputError, Nurbs, Stamp, Status, ThreadState, Truth
 from tests.conftest import make_rig, wait_until
 
@@ -156,6 +158,25 @@ def test_an_unknown_scenario_gets_the_list() -> None:
 def test_a_folder_without_pairs_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no <name>/calibration\.yaml"):
         next(initialization_rows(InitializationBench(pairs=tmp_path)))
+
+
+def test_first_curves_are_judged_by_their_order_however_they_are_filmed() -> None:
+    picture = Picture(size=(480, 360), distortion=-0.2, jpeg=90)
+    config = InitializationBench(("figure8-107",), seeds=1, picture=picture)
+    (row,) = initialization_rows(config)
+    assert row.solved
+    assert row.in_order_percent > 95
+    assert row.mean < 0.3
+
+
+def test_the_bench_shows_what_an_automatic_c_is_worth(monkeypatch: pytest.MonkeyPatch) -> None:
+    options = ("ours", "ours, c = 10")
+    monkeypatch.setattr(segmentation, "_OPTIONS", {o: segmentation._OPTIONS[o] for o in options})
+    monkeypatch.setattr(segmentation, "_MOMENTS_S", (0, 1, 2))
+    swings = segmentation._swings(SegmentationBench(("figure8-107",), seeds=1))
+    ours, fixed = (swings[o] for o in options)
+    assert 0 < ours.flicker_percent < fixed.flicker_percent
+    assert 0.3 < ours.least_strength <= ours.strength < 1
 
 
 def test_rows_are_printed_and_written_whole(tmp_path: Path) -> None:

@@ -34,3 +34,38 @@ def test_a_curve_that_misses_a_part_is_close_one_way_only() -> None:
     assert error.length_percent == pytest.approx(-50)
     assert error.largest == pytest.approx(50)
     assert metrics.coverage(half, LINE, 1.0) == pytest.approx(0.51, abs=0.01)
+
+
+def test_order_is_what_nearness_does_not_tell() -> None:
+    """A loop that is walked the wrong way round is near the thread everywhere."""
+    s = np.linspace(0, 1, 500)
+    straight = np.stack([20 * s, 0 * s, 0 * s], axis=1)
+    turn = 2 * np.pi * s
+    loop = np.stack([20 + 4 * np.sin(turn), 4 - 4 * np.cos(turn), 0 * s], axis=1)
+    truth = np.concatenate([straight, loop, straight + np.array([20, 0, 0])])
+    backwards = np.concatenate([straight, loop[::-1], straight + np.array([20, 0, 0])])
+    length = metrics.polyline_length(truth)
+    assert metrics.polyline_distances(backwards, truth).max() < 0.01
+    assert metrics.in_order(truth, truth, 0.01 * length) == 1
+    assert metrics.in_order(truth[::-1] + np.array([0, 0.3, 0]), truth, 0.01 * length) == 1
+    assert 0.5 < metrics.in_order(backwards, truth, 0.01 * length) < 0.75
+    assert metrics.in_order(truth[: len(truth) // 3], truth, 0.01 * length) < 0.4
+
+
+def test_walking_in_order_pays_the_least() -> None:
+    """Against the recursion of dynamic time warping as it is written in books."""
+    rng = np.random.default_rng(4)
+    for shape in ((6, 9), (9, 6), (7, 7)):
+        distances = rng.uniform(0, 1, shape)
+        met = metrics._warped(distances)
+        cost = np.full((shape[0] + 1, shape[1] + 1), np.inf)
+        cost[0, 0] = 0
+        for i, j in np.ndindex(*shape):
+            before = min(cost[i, j], cost[i, j + 1], cost[i + 1, j])
+            cost[i + 1, j + 1] = distances[i, j] + before
+        i, j = shape
+        expected = np.zeros(shape[1])
+        while (i, j) != (0, 0):
+            expected[j - 1] = max(expected[j - 1], distances[i - 1, j - 1])
+            i, j = min(((i - 1, j - 1), (i - 1, j), (i, j - 1)), key=lambda at: float(cost[at]))
+        np.testing.assert_allclose(met, expected)

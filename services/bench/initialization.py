@@ -6,7 +6,7 @@ import csv
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -20,10 +20,13 @@ from suturetrack.calibration import load_calibration
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationError, initialize
 from suturetrack.segmentation import Segmenter
-from suturetrack.stage import SCENARIOS, open_scene
+from suturetrack.stage import SCENARIOS, Picture, open_scene
 from suturetrack.types import Float64, InputError, Nurbs, Seed, Stamp, StereoFrame
 
 _SAMPLES = 600
+_ORDER_RADIUS = 0.01
+"""How near to the truth a place of the curve is that is in order, as a share of the true length."""
+_IN_ORDER_PERCENT = 95.0
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class InitializationBench:
     """The seeds count from here."""
     rig: str = "bench"
     """The rig of the scenes."""
+    picture: Picture = field(default_factory=Picture)
+    """How the scenes are filmed."""
     pairs: Path | None = None
     """A folder of pairs: <name>/{left.png,right.png,calibration.yaml,seed.json,truth.json} and, where
     there are published figures, published.csv with the columns file, ours_len, gt_len, e_mean, e_max."""
@@ -59,6 +64,8 @@ class Row:
     length_error_percent: float
     published_length_error_percent: float
     worst_end: float
+    in_order_percent: float
+    """Share of the thread that is met when curve and thread are walked from end to end."""
     reprojection_px: float
     seconds: float
     reason: str
@@ -71,7 +78,7 @@ def rows(config: InitializationBench) -> Iterator[Row]:
     names = config.scenarios or (() if config.pairs is not None else tuple(SCENARIOS))
     for name in names:
         for k in range(config.seeds):
-            yield _scene(name, config.first_seed + k, config.rig)
+            yield _scene(name, config.first_seed + k, config)
 
 
 def run(config: InitializationBench, console: Console) -> list[Row]:
@@ -82,19 +89,20 @@ def run(config: InitializationBench, console: Console) -> list[Row]:
     if solved:
         console.print(
             f"{len(solved)} of {len(table)} solved; median mean error "
-            f"{np.median([r.mean for r in solved]):.3g}, worst {max(r.mean for r in solved):.3g}"
+            f"{np.median([r.mean for r in solved]):.3g}, worst {max(r.mean for r in solved):.3g}; "
+            f"{sum(r.in_order_percent >= _IN_ORDER_PERCENT for r in table)} in order"
         )
     return table
 
 
-def _scene(name: str, seed: int, rig: str) -> Row:
-    scene = open_scene(name, seed, rig)
+def _scene(name: str, seed: int, config: InitializationBench) -> Row:
+    scene = open_scene(name, seed, config.rig, picture=config.picture)
     thread = scene.threads[0]
     truth = next(t for t in scene.truth(0) if t.thread == thread)
     frame = StereoFrame(Stamp(0, 0, 0), *scene.render(0))
     start = Seed(thread, pixel=scene.seed_pixel(0, thread))
     unit = 1000 * scene.rig.metres_per_unit
-    return _row(f"{name}, {rig}", seed, frame, scene.rig, start, truth.points, unit, {})
+    return _row(f"{name}, {config.rig}", seed, frame, scene.rig, start, truth.points, unit, {})
 
 
 def _pairs(folder: Path) -> Iterator[Row]:
@@ -144,7 +152,7 @@ def _row(
         segmenter.learn(frame, seed)
         first = initialize(segmenter.step(frame), rig, seed)
     except InitializationError as error:
-        blank = dict.fromkeys(("mean", "largest", "rms", "length", "end", "pixels"), nan)
+        blank = dict.fromkeys((*_ERRORS, "pixels"), nan)
         reason, confidence = str(error), 0.0
     else:
         blank = _errors(first.curve, truth, unit) | {"pixels": first.reprojection_px}
@@ -162,22 +170,29 @@ def _row(
         length_error_percent=blank["length"],
         published_length_error_percent=_published_length(published),
         worst_end=blank["end"],
+        in_order_percent=blank["order"],
         reprojection_px=blank["pixels"],
         seconds=time.perf_counter() - began,
         reason=reason,
     )
 
 
+_ERRORS = ("mean", "largest", "rms", "length", "end", "order")
+
+
 def _errors(curve: Nurbs, truth: Float64 | None, unit: float) -> dict[str, float]:
     if truth is None:
-        return dict.fromkeys(("mean", "largest", "rms", "length", "end"), float("nan"))
-    error = metrics.curve_error(_dense(curve), truth)
+        return dict.fromkeys(_ERRORS, float("nan"))
+    found = _dense(curve)
+    error = metrics.curve_error(found, truth)
+    radius = _ORDER_RADIUS * metrics.polyline_length(truth)
     return {
         "mean": unit * error.mean,
         "largest": unit * error.largest,
         "rms": unit * error.rms,
         "length": error.length_percent,
         "end": unit * max(error.ends),
+        "order": 100 * metrics.in_order(found, truth, radius),
     }
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -17,13 +18,15 @@ from scipy.spatial import cKDTree
 from services.bench import report
 from suturetrack.contrast import SIGMAS
 from suturetrack.segmentation import SegmentationConfig, Segmenter
-from suturetrack.stage import Scene, open_scene
+from suturetrack.stage import Picture, Scene, open_scene
 from suturetrack.types import Float64, Image, InputError, Seed, Stamp, StereoFrame
 
 T = TypeVar("T")
 Response = NDArray[Any]
 _REACH_PX = 2.0
 _THRESHOLDS = 24
+_SWING, _MOMENTS_S = 0.4, (0, 1, 2, 3, 4, 5, 6, 7)
+"""How far light and white balance swing, and when it is looked how well the threads are seen."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class SegmentationBench:
     """The seeds count from here."""
     rig: str = "bench"
     """The rig of the scenes."""
+    picture: Picture = field(default_factory=Picture)
+    """How the scenes are filmed."""
     repeats: int = 30
     """Frames timed; the references are timed on a fifth of them, in turns."""
 
@@ -56,16 +61,23 @@ class Row:
     """Share of the threads within 2 px of the found centreline; of several, the worst thread's."""
     f1: float
     worst_f1: float
+    strength: float
+    """Median length of the vectors on the threads while light and white balance swing by 40 %."""
+    least_strength: float
+    """That of the thread that is seen least, at its worst moment."""
+    flicker_percent: float
+    """Standard deviation of a thread's strength over the moments, of its mean; the mean of all."""
 
 
 def rows(config: SegmentationBench) -> list[Row]:
     """Runs every filter over every scene; times all of them in turns in one go."""
     scenes = [
-        open_scene(name, config.first_seed + k, config.rig)
+        open_scene(name, config.first_seed + k, config.rig, picture=config.picture)
         for name in config.scenarios
         for k in range(config.seeds)
     ]
     pictures = [_Picture.of(scene) for scene in scenes]
+    swings = _swings(config)
     timings = _timings(scenes[0], config.repeats)
     reference = timings["frangi (scikit-image)"]
     table = []
@@ -73,7 +85,9 @@ def rows(config: SegmentationBench) -> list[Row]:
         scores = np.array([_score(picture, respond(picture)) for picture in pictures])
         precision, recall, f1 = scores.mean(0)
         ms = timings[name]
-        row = Row(name, ms, reference / ms, precision, recall, f1, float(scores[:, 2].min()))
+        worst = float(scores[:, 2].min())
+        swing = swings.get(name, _Swing())
+        row = Row(name, ms, reference / ms, precision, recall, f1, worst, *astuple(swing))
         table.append(row)
     return table
 
@@ -90,6 +104,8 @@ _OPTIONS = {
     "ours": SegmentationConfig(),
     "ours, both polarities": SegmentationConfig(polarity="both"),
     "ours, two scales": SegmentationConfig(_TWO),
+    "ours, c = 10": SegmentationConfig(c=10.0),
+    "ours, no adaptation": SegmentationConfig(adapt=False),
     "ours, gray": SegmentationConfig(channel="gray"),
     "ours, red": SegmentationConfig(channel="red"),
     "ours, green": SegmentationConfig(channel="green"),
@@ -99,6 +115,15 @@ _OPTIONS = {
     "ours, gray, both, no seed": SegmentationConfig(channel="gray", polarity="both"),
 }
 """What each option is worth: the defaults, then one changed at a time, then nothing learned."""
+
+
+@dataclass(frozen=True)
+class _Swing:
+    """The last columns of a row; nan for filters whose response has no scale."""
+
+    strength: float = math.nan
+    least_strength: float = math.nan
+    flicker_percent: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +196,50 @@ def _timings(scene: Scene, repeats: int) -> dict[str, float]:
             pair = [_gray(frame.left), _gray(frame.right)]
             taken.setdefault(name, []).append(_milliseconds(function, pair))
     return {name: float(np.median(values)) for name, values in taken.items()}
+
+
+def _swings(config: SegmentationBench) -> dict[str, _Swing]:
+    """How strongly and steadily every option shows the threads of all scenes while the light swings."""
+    look = replace(config.picture, drift=_SWING)
+    seen: dict[str, list[Float64]] = {name: [] for name in _OPTIONS}
+    for scenario in config.scenarios:
+        for k in range(config.seeds):
+            scene = open_scene(scenario, config.first_seed + k, config.rig, picture=look)
+            for name, strengths in _strengths(scene).items():
+                seen[name] += strengths
+    return {
+        name: _Swing(
+            float(np.median(strengths)),
+            float(min(s.min() for s in strengths)),
+            float(np.mean([100 * s.std() / s.mean() for s in strengths])),
+        )
+        for name, strengths in seen.items()
+    }
+
+
+def _strengths(scene: Scene) -> dict[str, list[Float64]]:
+    """By option and thread: median length of the vectors on the thread at every moment."""
+    segmenters = {name: Segmenter(scene.rig, config) for name, config in _OPTIONS.items()}
+    taken: dict[str, dict[str, list[float]]] = {
+        name: {thread: [] for thread in scene.threads} for name in _OPTIONS
+    }
+    largest = np.array(scene.rig.image_size) - 1
+    for moment in _MOMENTS_S:
+        i = round(moment * scene.fps)
+        frame = StereoFrame(Stamp(i, 0, 0), *scene.render(i))
+        shown = {t.thread: t.points[t.visible] for t in scene.truth(i)}
+        for name, segmenter in segmenters.items():
+            for thread in scene.threads if i == 0 and "no seed" not in name else ():
+                segmenter.learn(frame, Seed(thread, pixel=scene.seed_pixel(0, thread)))
+            length = np.linalg.norm(segmenter.step(frame).left, axis=-1)
+            for thread, points in shown.items():
+                pixels = np.rint(scene.rig.project(points)[0]).astype(int)
+                u, v = np.clip(pixels, 0, largest).T
+                taken[name][thread].append(float(np.median(length[v, u])))
+                segmenter.adapt(frame, scene.rig.project_raw(points)[0], thread)
+    return {
+        name: [np.array(values) for values in threads.values()] for name, threads in taken.items()
+    }
 
 
 def _score(picture: _Picture, response: Response) -> tuple[float, float, float]:
