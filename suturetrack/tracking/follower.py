@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,6 +45,8 @@ _SURE_AFTER_S = 0.08
 # How long a doubtful end is held before it is cut off.
 _PATIENCE_S = 0.06
 _SOME = 0.2
+# How long a thread is remembered to have been longer.
+_FORGOTTEN_S = 3.0
 # Places on a thread that keep other threads away.
 _CLAIMS = 160
 
@@ -121,7 +124,7 @@ class Follower:
         astray, plain = evidence.astray(field, self.rig, model.levels, neighbours)
         overlong = self._overlong(plain, evidence)
         wrong = astray | (~plain & overlong)
-        status = self._judge(evidence, wrong, plain, overlong)
+        status = self._judge(evidence, wrong, plain, overlong, seconds)
         return self._state(field, thread, evidence, status, events)
 
     def _overlong(self, plain: Bool, evidence: Evidence) -> bool:
@@ -136,7 +139,9 @@ class Follower:
         noise = _NOISE_SIGMAS * float(np.median(evidence.evenly()[0]))
         return self._established and length > (1 + _GROWTH) * self.known_length + noise
 
-    def _judge(self, evidence: Evidence, wrong: Bool, plain: Bool, overlong: bool) -> Status:
+    def _judge(
+        self, evidence: Evidence, wrong: Bool, plain: Bool, overlong: bool, seconds: float
+    ) -> Status:
         """The status; a curve that was lost must have its length again to be held."""
         model = self.model
         if plain.mean() > _ALL and model.ends.settled and self._cut:
@@ -145,7 +150,7 @@ class Follower:
         doubted = wrong | self._doubt.anywhere
         certain = doubted.mean() <= ASTRAY and not overlong and not self._short
         if certain and plain.mean() > _ALL and not (self._lost or self._cut):
-            self.known_length = model.ends.length
+            self._learn_length(seconds)
         if not certain:
             self._doubted_ns = model.capture_ns
         if (model.capture_ns - self._doubted_ns) * _NS > _SURE_AFTER_S:
@@ -166,6 +171,13 @@ class Follower:
         elif uncertain_s > _PATIENCE_S and self.config.method != "paper":
             self._trim(wrong | self._doubt.hopeless)
         return status
+
+    def _learn_length(self, seconds: float) -> None:
+        """An end that is lost for a moment makes the thread no shorter."""
+        ends = self.model.ends
+        longest = max(self.known_length, ends.length)
+        fading = 0.0 if ends.settled else math.exp(-max(seconds, 0.0) / _FORGOTTEN_S)
+        self.known_length = ends.length + (longest - ends.length) * fading
 
     @property
     def _short(self) -> bool:

@@ -14,7 +14,7 @@ from suturetrack.types import Bool, Float64, Nurbs
 
 _KNOTS = clamped_knots(np.linspace(0, 1, 6)[1:-1], spline.DEGREE)
 _PLACES = 40
-_GAIN = 0.6
+_GAIN = 0.9
 _FADING_S = 0.5
 _LONGEST_STEP_S = 0.25
 # Rows that keep the velocity even along the thread, against those that measure it.
