@@ -44,11 +44,11 @@ def main() -> None:
 def _load() -> None:
     import numpy as np
 
-    from services import segmenter, source, tracker
+    from services import recording, segmenter, source, tracker
     from services.service import compiling
     from suturetrack.camera import StereoRig
 
-    del source
+    del recording, source
     camera = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]]), np.zeros(5)
     rig = StereoRig.from_calibration(
         (640, 480), camera, camera, np.eye(3), np.array([-0.04, 0, 0]), 1.0

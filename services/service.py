@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import psutil
 
@@ -24,11 +24,13 @@ from services.bus import Bus
 from services.checks import check_name
 from services.messages import Health
 from services.meter import Meter
-from services.recording import Recorder
 from services.zenoh_transport import ZenohTransport, load_config, local_config
 from suturetrack import kernels
 from suturetrack.camera import StereoRig
 from suturetrack.types import InputError, Stamp
+
+if TYPE_CHECKING:
+    from services.recording import Recorder
 
 HEARTBEAT_S = 1.0
 _GRACE_S = 1.2
@@ -90,6 +92,8 @@ class Service:
 
     def record(self, rig: StereoRig, config: object) -> Recorder:
         """Opens the recording; it is closed with the service."""
+        from services.recording import Recorder  # late, for those that record nothing
+
         run_dir, level = self.config.run_dir, self.config.recording
         patient = self.config.lockstep
         self.recorder = Recorder(run_dir, self.name, level, rig, config, patient=patient)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,9 +41,9 @@ def test_all_of_it_is_refused(kind: type) -> None:
             wire.decode(packet, kind)
 
 
-@pytest.fixture
-def system(options: list[str], tmp_path: Path) -> Iterator[System]:
-    with private_sockets(), System(RIG, options, tmp_path) as running:
+@pytest.fixture(scope="module")
+def system(options: list[str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    with private_sockets(), System(RIG, options, tmp_path_factory.mktemp("system")) as running:
         running.until_tracking()
         yield running
 

@@ -24,6 +24,8 @@ from suturetrack import nurbs
 from suturetrack.types import InputError, Status
 
 FPS = 30.0
+SOON_S = 15.0
+"""On a machine that does other things too; `bench faults` and the long run hold the two seconds."""
 
 
 @pytest.fixture(scope="module")
@@ -78,45 +80,24 @@ def test_a_consumer_is_not_told_live_three_periods_after_a_fault(system: System,
         assert 0 <= measured.stale_ms[0] < 1000
 
 
-@pytest.mark.parametrize("process", ROLES)
-def test_a_process_that_dies_is_replaced_and_the_thread_is_regained(
-    system: System, process: str
-) -> None:
-    others = {n: p.pid for n, p in system.processes().items() if n != process}
-    before = system.client.latest()
-    assert before is not None
-    kill(system, process)
-    assert system.until_tracking() < 2.0
-    after = system.client.latest()
-    assert after is not None
-    assert after.state.thread == before.state.thread == "0"
-    assert after.state.stamp.frame > before.state.stamp.frame
-    assert direction(after) @ direction(before) > 0
-    assert abs(after.state.length / before.state.length - 1) < 0.1
-    assert others == {n: p.pid for n, p in system.processes().items() if n != process}
-    assert f"the {process} was killed by signal 9; it is started again" in system.said
-
-
 def nursery(system: System) -> psutil.Process | None:
     found = psutil.Process(system.launcher).children()
     return next((child for child in found if child.name() == "nursery"), None)
 
 
 def test_a_death_right_after_another_is_made_good_as_soon(system: System) -> None:
-    kill(system, "tracker")
-    system.until(lambda: system.pid("tracker"))
-    kill(system, "tracker")
-    # What is waited for begins after the back-off, at the new start.
-    assert system.until_tracking() < 2.0
+    for _ in range(2):
+        kill(system, "tracker")
+        assert system.until_tracking() < SOON_S
 
 
 def test_without_the_nursery_a_process_is_started_all_the_same(system: System) -> None:
-    pid, dead = system.pid("tracker"), nursery(system)
+    pid, dead = system.pid("source"), nursery(system)
     assert pid is not None
     assert dead is not None
     dead.kill()
     os.kill(pid, signal.SIGKILL)
-    system.until(lambda: system.pid("tracker") not in (None, pid))
+    system.until(lambda: system.pid("source") not in (None, pid))
     system.until_tracking()
     assert nursery(system) not in (None, dead)
 
@@ -128,6 +109,11 @@ def test_a_process_that_hangs_is_ended_and_started_again(system: System) -> None
     system.until(lambda: system.pid("segmenter") not in (None, pid))
     system.until_tracking()
     assert "the segmenter hung and was killed: nothing was heard of it for 5 s" in system.said
+
+
+def test_deaths_lose_neither_threads_nor_more_than_a_second_of_recordings(system: System) -> None:
+    """The last one on this system, which it stops."""
+    die_at_random(system, 1, most_s=SOON_S)
 
 
 @pytest.fixture
@@ -169,17 +155,14 @@ def test_what_is_at_fault_in_the_input_is_not_tried_again(start: Callable[..., S
     assert "started again" not in system.said
 
 
-def test_deaths_leave_recordings_that_open_and_lack_a_second_at_most(
-    start: Callable[..., System],
-) -> None:
-    # The two seconds are for a machine that does nothing else; `bench faults` and the long run hold them.
-    die_at_random(start("--restarts", "1000"), 1, most_s=15.0)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("process", ROLES)
 def test_a_hundred_deaths(start: Callable[..., System], process: str) -> None:
     die_at_random(start("--restarts", "1000"), 100, (process,))
+
+
+def restarts(system: System) -> int:
+    return system.said.count("it is started again")
 
 
 def die_at_random(
@@ -192,22 +175,30 @@ def die_at_random(
         lambda s: seen.setdefault(s.state.stamp.frame, s.state.stamp.released_ns / 1e9)
     )
     system.until_tracking()
-    before = direction(system.client.latest())
+    before, earlier = system.client.latest(), restarts(system)
+    assert before is not None
     for _ in range(times):
         for process in processes:
             until = time.monotonic() + chance.uniform(0.3, 1.5)
             system.until(lambda until=until: time.monotonic() > until)
             system.until_tracking()
+            others = {n: p.pid for n, p in system.processes().items() if n != process}
             deaths.append((process, kill(system, process)))
             back.append(system.until_tracking())
-            assert direction(system.client.latest()) @ before > 0
+            after = system.client.latest()
+            assert after is not None
+            assert after.state.thread == before.state.thread == "0"
+            assert direction(after) @ direction(before) > 0
+            assert abs(after.state.length / before.state.length - 1) < 0.1
+            assert others == {n: p.pid for n, p in system.processes().items() if n != process}
+            assert f"the {process} was killed by signal 9; it is started again" in system.said
     assert system.stop() == 0
     assert np.percentile(back, 99) < most_s, np.percentile(back, (50, 99, 100))
     folder = RunFolder(system.run_dir)
     assert not [p for p in folder.problems if "is no recording" in p]
-    assert len(folder.files) == 3 + len(deaths)
-    for process, topic in (("tracker", "ThreadState"), ("source", "frame")):
-        del topic
+    assert restarts(system) == earlier + len(deaths)
+    assert len(folder.files) == 3 + restarts(system)
+    for process in ("tracker", "source"):
         recorded = folder.handled(process)
         ends = [when for name, when in deaths if name == process]
         for frame, released in seen.items():

@@ -212,16 +212,16 @@ def test_two_runs_at_once_keep_apart_and_a_name_is_used_once(
 ) -> None:
     first = start("run", *STAGE, "--run-dir", tmp_path / "a", "--rig", "bench")
     wait_until(lambda: len(sockets()) == 4)
+    second = start(*run_pairs(pairs, tmp_path / "c"))
     refused = start("run", *STAGE, "--run-dir", tmp_path / "b", "--rig", "bench")
-    _, err = refused.communicate(timeout=20)
+    source = start("source", *STAGE, "--rig", "bench")
+    _, err = refused.communicate(timeout=30)
     assert refused.returncode == 1
     assert "rig 'bench' runs already" in err
     assert not (tmp_path / "b").exists()
-    source = start("source", *STAGE, "--rig", "bench")
-    _, err = source.communicate(timeout=20)
+    _, err = source.communicate(timeout=30)
     assert source.returncode == 1
     assert "a process named 'source' is running already" in err
-    second = start(*run_pairs(pairs, tmp_path / "c"))
     _, err = second.communicate(timeout=60)
     assert second.returncode == 0, err
     first.terminate()

@@ -40,6 +40,7 @@ from services.bus import Bus
 from services.zenoh_transport import ZenohTransport, local_config
 bus = Bus(ZenohTransport(local_config(sys.argv[1], "slow")), sys.argv[1], "slow")
 readers = [bus.newest(topics.FRAME), bus.newest(topics.FIELD), bus.every(topics.STATE)]
+print("ready", flush=True)
 while True:
     [reader.get(0) for reader in readers]
     time.sleep(0.5)
@@ -172,8 +173,11 @@ def measure(load: str, fps: float, seconds: float, options: list[str], folder: P
 def _slow_consumers(rig: str) -> list[subprocess.Popen[bytes]]:
     """One that reads twice a second, and one that stands still."""
     command = [sys.executable, "-c", _SLOW_CONSUMER, rig]
-    consumers = [subprocess.Popen(command) for _ in range(2)]
-    time.sleep(_FIRST_SECONDS)
+    consumers = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(2)]
+    for consumer in consumers:
+        assert consumer.stdout is not None
+        with consumer.stdout as said:
+            said.readline()
     os.kill(consumers[0].pid, signal.SIGSTOP)
     return consumers
 
