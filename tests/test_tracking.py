@@ -112,6 +112,18 @@ def test_another_tracker_takes_a_thread_up(rig: StereoRig, away_s: float) -> Non
     assert np.linalg.norm(stop - fixed) < np.linalg.norm(start - fixed)
 
 
+def test_another_tracker_is_not_kept_from_a_thread_by_a_bad_last_state(rig: StereoRig) -> None:
+    points = thread(0.0)
+    seed = seed_on(rig, points)
+    last = follow([paint(rig, [points], i) for i in range(3)], rig, seed)[-1]
+    tracker = Tracker(rig)
+    tracker.resume(seed, replace(last, length=0.92 * last.length))
+    states = [tracker.step(paint(rig, [points], i)).states[0] for i in range(3, 60)]
+    assert all(state.status is Status.LOST for state in states[: round(0.5 * FPS)])
+    assert states[-1].status is Status.TRACKING
+    assert error(states[-1], points).rms < 0.1
+
+
 def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:
     truths = [thread(i / FPS) for i in range(30)]
     fields = []

@@ -21,7 +21,7 @@ _SHARED = 0.3
 
 def find_again(
     last: Nurbs,
-    known_length: float,
+    known_length: float | None,
     seed: Seed,
     field: RidgeField,
     rig: StereoRig,
@@ -29,14 +29,14 @@ def find_again(
 ) -> Nurbs | None:
     """The thread in the field, run in the direction of the last curve; None where it is not found.
 
-    A curve counts as the thread if its length is the known one.
+    A curve counts as the thread if its length is the known one, or none is known.
     """
     for start in (*_seeds_on(last, seed.thread, field, rig), seed):
         try:
             curve = initialize(field, rig, start, config).curve
         except InitializationError:
             continue
-        if abs(length(curve) / known_length - 1) < _LENGTH_TOLERANCE:
+        if known_length is None or abs(length(curve) / known_length - 1) < _LENGTH_TOLERANCE:
             return directed(curve, last)
     return None
 

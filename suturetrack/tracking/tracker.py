@@ -86,7 +86,8 @@ class Tracker:
             seed: from where it was looked for at first; names the thread.
             last: its last state, with a curve.
 
-        It keeps the direction of the last curve, and counts as found if it has the same length.
+        It keeps the direction of the last curve, and counts as found if it has the same length; after
+        some attempts in vain whatever its length is, for the last state may have been a bad one.
         """
         last = replace(last, status=Status.LOST, events=())
         self._threads[seed.thread] = _Thread(seed, 0, None, last)
@@ -141,11 +142,12 @@ class Tracker:
     def _regain(
         self, name: str, thread: _Thread, curve: Nurbs, last: ThreadState, field: RidgeField
     ) -> ThreadState:
-        again = self._look_again(name, thread, curve, last.length, field)
+        known_length = last.length if thread.failures < _QUICK_ATTEMPTS else None
+        again = self._look_again(name, thread, curve, known_length, field)
         return again or replace(last, stamp=field.stamp)
 
     def _look_again(
-        self, name: str, thread: _Thread, last: Nurbs, known_length: float, field: RidgeField
+        self, name: str, thread: _Thread, last: Nurbs, known_length: float | None, field: RidgeField
     ) -> ThreadState | None:
         """The state of a lost thread that is found again, every now and then looked for."""
         if field.stamp.capture_ns < thread.wait_ns:
