@@ -105,6 +105,7 @@ def test_bad_messages_are_counted_and_harm_nothing(system: System, count: int) -
     seconds = time.monotonic() - began
     system.until_tracking()
     assert {name: process.pid for name, process in system.processes().items()} == pids
+    print({process: (refused(process), attacker.health[process].memory_mb) for process in ROLES})
     for process in ROLES:
         grown = attacker.health[process].memory_mb - before[process].memory_mb
         assert grown < MOST_GROWTH_MB, process
