@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import queue
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -31,6 +32,7 @@ _BACKLOG = 32
 """Values that may wait for the disk."""
 _PICTURE_FRAMES = 3
 """Frames from one picture of the fields to the next, where it is all that is kept of them."""
+_TURN_SECONDS = 5e-4
 _STALL_SECONDS = 5.0
 _CLOSING_SECONDS = 10.0
 
@@ -80,6 +82,8 @@ class Recorder:
         self._file: RunFile | None = None
         if run_dir is None:
             return
+        # The loop, which does not wait for the recording thread, gets its turn at once.
+        sys.setswitchinterval(_TURN_SECONDS)
         self._file = RunFile(run_dir, process, level, rig, config, flush_seconds, part_bytes)
         self._tasks: queue.Queue[Callable[[RunFile], None] | None] = queue.Queue(_BACKLOG)
         self._worker = threading.Thread(
@@ -216,7 +220,7 @@ class Recorder:
             try:
                 task = self._tasks.get(timeout=self._pause)
             except queue.Empty:
-                task = RunFile.flush_if_due
+                task = RunFile.pass_on
             self._busy_since = time.monotonic()
             (task or RunFile.close)(file)
             self._busy_since = None

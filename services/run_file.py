@@ -9,7 +9,6 @@ import logging
 import platform
 import time
 import uuid
-from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from services import drawing
 from services.drawing import Entry, Level
 from services.writer import Writer
 from suturetrack.camera import StereoRig
-from suturetrack.types import InputError, Stamp
+from suturetrack.types import InputError
 
 APPLICATION = "suturetrack"
 RECORDING_VERSION = 1
@@ -29,6 +28,8 @@ RECORDING_VERSION = 1
 
 _log = logging.getLogger(__name__)
 _LONGEST_FLUSH_SECONDS = 4.0
+_LONGEST_PART_SECONDS = 300.0
+"""Rerun keeps an index of an open file in memory: 20 MB a minute of a tracked thread."""
 
 
 class RunFile(Writer):
@@ -66,31 +67,28 @@ class RunFile(Writer):
         Raises:
             InputError: the file cannot be made.
         """
-        super().__init__(None, process, level, rig)
-        self._config, self._flush_seconds, self._part_bytes = config, flush_seconds, part_bytes
-        self._flushed = time.monotonic()
-        self._run_dir = run_dir
+        # One name for all processes of the run makes their files one recording.
+        run = uuid.uuid5(uuid.NAMESPACE_URL, str(run_dir.resolve()))
+        stream = rr.RecordingStream(APPLICATION, recording_id=str(run))
+        super().__init__(stream, process, level, rig)
+        self._config, self._run_dir = config, run_dir
+        self._flush_seconds, self._part_bytes = flush_seconds, part_bytes
+        self._flushed = self._opened = time.monotonic()
         try:
-            self._run_dir.mkdir(parents=True, exist_ok=True)
-            # One name for all processes of the run makes their files one recording.
-            run = uuid.uuid5(uuid.NAMESPACE_URL, str(self._run_dir.resolve()))
-            self.stream = rr.RecordingStream(APPLICATION, recording_id=str(run))
-            self._open_part()
+            run_dir.mkdir(parents=True, exist_ok=True)
+            self._open_part(stream)
         except (OSError, RuntimeError) as error:
             raise InputError(f"recording: cannot write to {run_dir}: {error}") from error
 
     def close(self) -> None:
         """Completes the file; nothing is recorded afterwards."""
         if self.stream is not None:
+            if self.problem is None:
+                self.columns.send()
             self.stream.disconnect()
         self.stream = None
 
-    def write(self, stamp: Stamp | None, entries: Iterable[Entry]) -> None:
-        """Writes, and looks after the file."""
-        super().write(stamp, entries)
-        self.flush_if_due()
-
-    def flush_if_due(self) -> None:
+    def pass_on(self) -> None:
         """When it is time: sends to the disk what is waiting, begins a new part, looks for trouble."""
         if self.stream is None or time.monotonic() - self._flushed < self._flush_seconds:
             return
@@ -104,27 +102,26 @@ class RunFile(Writer):
     def _care_for(self, stream: rr.RecordingStream) -> str | None:
         """What is wrong with the file, if anything."""
         try:
+            self.columns.send()
             stream.flush(timeout_sec=_LONGEST_FLUSH_SECONDS)
-            if self._path.stat().st_size >= self._part_bytes:
-                self._open_part()
+            full = self._path.stat().st_size >= self._part_bytes
+            if full or time.monotonic() - self._opened > _LONGEST_PART_SECONDS:
+                self._open_part(stream)
         except FileNotFoundError:
             return "the file or its folder was removed"
         except (OSError, RuntimeError):
             return "the disk is full or too slow"
         return None
 
-    def _open_part(self) -> None:
+    def _open_part(self, stream: rr.RecordingStream) -> None:
         """Directs the stream to the next free file; every part explains itself."""
-        assert self.stream is not None
         name, number = self._run_dir / f"{self.process}.rrd", 0
         while name.exists():
             number += 1
             name = self._run_dir / f"{self.process}.{number}.rrd"
-        self._path = name
-        sink = rr.FileSink(str(name))
-        self.stream.set_sinks(sink, default_blueprint=self.layout())
-        self.stream.send_recording_name(self._run_dir.name)
-        self.stream.reset_time()
+        self._path, self._opened = name, time.monotonic()
+        stream.set_sinks(rr.FileSink(str(name)), default_blueprint=self.layout())
+        stream.send_recording_name(self._run_dir.name)
         self.describe()
         self.write_static(self._about())
 

@@ -49,7 +49,7 @@ def run(service: Service, config: SourceConfig) -> None:
     if config.service.lockstep and footage.live:
         raise InputError("--lockstep needs recorded input; a camera does not wait")
     bus = service.bus
-    steps = bus.every(topics.STEP)
+    steps = bus.newest(topics.STEP)
     bus.answer(topics.CALIBRATION, lambda _: rig)
     recorder = service.record(rig, config)
     first = footage.read(0)

@@ -11,6 +11,7 @@ import rerun.blueprint as rrb
 
 from services import drawing
 from services.blueprint import blueprint
+from services.columns import Columns
 from services.drawing import Entry, Level
 from services.messages import Forget, Health
 from suturetrack import nurbs
@@ -36,24 +37,29 @@ class Writer:
     """What one process sees and decides, written to a stream; to none once it is closed."""
 
     def __init__(
-        self, stream: rr.RecordingStream | None, process: str, level: Level, rig: StereoRig
+        self, stream: rr.RecordingStream, process: str, level: Level, rig: StereoRig
     ) -> None:
         self.process, self.level, self.rig = process, level, rig
-        self.stream = stream
+        self.stream: rr.RecordingStream | None = stream
+        self.columns = Columns(stream)
         self._stamp: Stamp | None = None
         self._statuses: dict[str, Status | None] = {}
         self._before: dict[str, ThreadState] = {}
         self._marked: dict[str, int] = {}
         self._seeds: dict[str, Seed] = {}
         self._seeded: set[str] = set()
+        self._true: set[str] = set()
         self._target: Float64 | None = None
 
     def describe(self) -> None:
         """Writes what does not change: cameras, and the look of what was introduced so far."""
         self.write_static(drawing.cameras(self.rig))
         self.write_static(drawing.process_style(self.process))
+        self.write_static(drawing.overlay_style())
         for thread in self._statuses:
             self.write_static(drawing.thread_style(thread))
+        for thread in self._true:
+            self.write_static(drawing.truth_style(thread))
 
     def frame(self, frame: StereoFrame, published_ns: int | None = None) -> None:
         """Records both images; `published_ns` is now when not given."""
@@ -111,12 +117,16 @@ class Writer:
                 if seed is not self._seeds.get(thread):
                     self._seeds[thread] = seed
                     self._seeded.add(thread)
-            self._initialization(self.stream, field.stamp, thread, result)
+            self._initialization(field.stamp, thread, result)
 
     def truth(self, truth: Truth) -> None:
         """Records where a synthetic thread really is."""
-        if self.stream is not None:
-            self.write(truth.stamp, drawing.truth(truth, self.rig))
+        if self.stream is None:
+            return
+        if truth.thread not in self._true:
+            self._true.add(truth.thread)
+            self.write_static(drawing.truth_style(truth.thread))
+        self.write(truth.stamp, drawing.truth(truth, self.rig))
 
     def health(self, health: Health) -> None:
         """Records the process's heartbeat, at its newest frame."""
@@ -142,17 +152,20 @@ class Writer:
         target = ahead if self._target is None else self._target
         return blueprint(list(self._statuses), target)
 
-    def write(self, stamp: Stamp | None, entries: Iterable[Entry]) -> None:
-        """Writes entries at the time of `stamp`, or else of the newest one."""
+    def write(
+        self, stamp: Stamp | None, entries: Iterable[Entry], growth: int | None = None
+    ) -> None:
+        """Writes entries at the time of `stamp`, and at a step of the timeline `growth`."""
         if self.stream is None:
             return
         if stamp is not None:
             self._stamp = stamp
-            # Times belong to the calling thread, so they are set on every call.
-            self.stream.set_time("frame", sequence=stamp.frame)
-            self.stream.set_time("capture", timestamp=np.datetime64(stamp.capture_ns, "ns"))
-        for entity, *what in entries:
-            self.stream.log(entity, *what)
+        self.columns.add(stamp, entries, growth)
+        self.pass_on()
+
+    def pass_on(self) -> None:
+        """Sends what was written on its way, at once."""
+        self.columns.send()
 
     def write_static(self, entries: Iterable[Entry]) -> None:
         """Writes entries that hold at all times."""
@@ -165,17 +178,11 @@ class Writer:
         self.write(stamp, [(f"/plots/latency_ms/{self.process}", rr.Scalars(latency_ms))])
 
     def _initialization(
-        self,
-        stream: rr.RecordingStream,
-        stamp: Stamp,
-        thread: str,
-        result: Initialization | InitializationError,
+        self, stamp: Stamp, thread: str, result: Initialization | InitializationError
     ) -> None:
         if result.growth is not None:
             for step, entries in enumerate(drawing.growth(thread, result.growth, self.rig), 1):
-                stream.set_time("growth", sequence=step)
-                self.write(stamp, entries)
-            stream.disable_timeline("growth")
+                self.write(stamp, entries, growth=step)
         self.write(stamp, drawing.outcome(stamp, thread, result))
         if isinstance(result, InitializationError):
             self.write(stamp, drawing.failure(thread, result.candidates, self.rig))

@@ -196,11 +196,11 @@ def test_what_is_drawn_and_plotted_is_the_state(played: Run) -> None:
         points = np.concatenate([np.asarray(s) for s in in_space])
         assert np.linalg.norm(points[:, None] - path, axis=2).min(axis=1).max() < 0.05
     velocity = rows(folder, "/rig/thread/0/velocity")
-    assert [len(r["Arrows3D:vectors"]) for r in velocity] == [0, 24, 24, 24]
+    assert [len(r["Arrows3D:vectors"]) for r in velocity] == [0, 25, 25, 25]
     before, after = (s.curve for s in heard[topics.STATE.key][1:3])
     assert before is not None
     assert after is not None
-    s = np.linspace(0, 1, 24)
+    s = np.linspace(0, 1, 25)
     moved = (nurbs.evaluate(after, s) - nurbs.evaluate(before, s)) * 30 * 0.1
     tangents = nurbs.tangents(after, s)
     moved -= (moved * tangents).sum(axis=1, keepdims=True) * tangents

@@ -5,7 +5,7 @@ pixels, points in the calibration's unit, plots in the units that their names ca
 """
 
 from services.drawing.common import Entry, Level, values
-from services.drawing.curves import states, thread_style, truth
+from services.drawing.curves import overlay_style, states, thread_style, truth, truth_style
 from services.drawing.events import kinds, lane, marks
 from services.drawing.growth import cleared, failure, growth, outcome, seed
 from services.drawing.images import cameras, field, frame, process_style
@@ -23,10 +23,12 @@ __all__ = [
     "lane",
     "marks",
     "outcome",
+    "overlay_style",
     "process_style",
     "seed",
     "states",
     "thread_style",
     "truth",
+    "truth_style",
     "values",
 ]

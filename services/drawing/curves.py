@@ -38,9 +38,11 @@ Strip = tuple[Float64, Color]
 
 _STATUS_COLORS = {Status.TRACKING: GREEN, Status.OCCLUDED: AMBER, Status.LOST: RED}
 _NONE = np.empty((0, 3))
-_DENSE = 240
+_S = np.linspace(0, 1, 241)
+"""Parameters of a drawn curve."""
+_ARROW_EVERY = 10
+_ARROWS_AT = _S[::_ARROW_EVERY]
 _DASH = 5
-_ARROWS = 24
 _WORST_SIGMA_PX = 8.0
 _LEVELS = 4
 _AHEAD_S = 0.1
@@ -54,12 +56,15 @@ def states(
     published_ns: int,
 ) -> Iterator[Entry]:
     """The curves: over both images, in space, and as plots; `before` are the last states by thread."""
-    strips = [_strips(state, rig) for state in states]
+    points = [_points(state) for state in states]
+    strips = [_strips(state, line, rig) for state, line in zip(states, points, strict=True)]
     curves = [state.curve.control_points for state in states if state.curve is not None]
     yield from _overlays([strip for pieces in strips for strip in pieces], curves, rig)
-    for state, pieces in zip(states, strips, strict=True):
-        yield from _in_space(state, pieces, rig)
-        yield from _motion(state, before.get(state.thread), rig)
+    for state, line, pieces in zip(states, points, strips, strict=True):
+        arrows = line[::_ARROW_EVERY]
+        slope = _NONE if state.curve is None else nurbs.derivative(state.curve, _ARROWS_AT)
+        yield from _in_space(state, arrows, slope, pieces, rig)
+        yield from _motion(state, before.get(state.thread), arrows, slope, rig)
         yield from _plots(state, rig)
         numbers = values("ThreadState", _numbers(state, published_ns))
         yield f"/rig/thread/{part(state.thread)}/nurbs", numbers
@@ -74,13 +79,31 @@ def truth(truth: Truth, rig: StereoRig) -> Iterator[Entry]:
         "length": truth.length,
         "visible": truth.visible,
     }
-    line = rr.LineStrips3D([truth.points], colors=[PINK], radii=-0.5)
+    line = rr.LineStrips3D([truth.points])
     yield f"/rig/truth/{part(truth.thread)}", line, values("Truth", numbers)
-    few = truth.points[np.linspace(0, len(truth.points) - 1, _DENSE).astype(int)]
+    few = truth.points[np.linspace(0, len(truth.points) - 1, len(_S)).astype(int)]
     for view, pixels in zip(VIEWS, rig.project_raw(few), strict=True):
-        # Below the curve, so that it shows where the curve is not.
-        strip = rr.LineStrips2D([_finite(pixels)], colors=PINK, radii=-1.0, draw_order=10)
+        strip = rr.LineStrips2D([_finite(pixels)])
         yield f"/rig/{view}/image/truth/{part(truth.thread)}", strip
+
+
+def truth_style(thread: str) -> Iterator[Entry]:
+    """Colour and width of a true thread; all of it static."""
+    yield f"/rig/truth/{part(thread)}", rr.LineStrips3D.from_fields(colors=PINK, radii=-0.5)
+    for view in VIEWS:
+        # Below the curve, so that it shows where the curve is not.
+        style = rr.LineStrips2D.from_fields(colors=PINK, radii=-1.0, draw_order=10)
+        yield f"/rig/{view}/image/truth/{part(thread)}", style
+
+
+def overlay_style() -> Iterator[Entry]:
+    """Colours and widths of what is drawn over the images; all of it static."""
+    for view in VIEWS:
+        yield (
+            f"/rig/{view}/image/curve",
+            rr.LineStrips2D.from_fields(radii=-1.5),
+            rr.Points2D.from_fields(colors=RED, radii=-3.0),
+        )
 
 
 def thread_style(thread: str) -> Iterator[Entry]:
@@ -94,6 +117,12 @@ def thread_style(thread: str) -> Iterator[Entry]:
     yield f"{plots}/speed", series(mean=TURQUOISE, fastest=ORANGE)
     colors = [(*c, 255) for c in _STATUS_COLORS.values()]
     yield f"{plots}/status", rr.StateConfiguration(values=statuses, colors=colors)
+    root = f"/rig/thread/{part(thread)}"
+    yield f"{root}/curve", rr.LineStrips3D.from_fields(radii=-2.0)
+    yield f"{root}/control_points", rr.Points3D.from_fields(colors=RED, radii=-3.5)
+    yield f"{root}/tangent", rr.Arrows3D.from_fields(colors=WHITE, radii=-0.75)
+    yield f"{root}/reliability", rr.Points3D.from_fields(radii=-2.5)
+    yield f"{root}/velocity", rr.Arrows3D.from_fields(colors=TURQUOISE, radii=-1.0)
     yield from event_style(thread)
 
 
@@ -107,8 +136,8 @@ def _overlays(
         pieces = [_finite(piece) for piece in np.split(line, ends[:-1])] if strips else []
         yield (
             f"/rig/{view}/image/curve",
-            rr.LineStrips2D(pieces, colors=colors, radii=-1.5),
-            rr.Points2D(_finite(dots), colors=RED, radii=-3.0),
+            rr.LineStrips2D(pieces, colors=colors),
+            rr.Points2D(_finite(dots)),
         )
 
 
@@ -116,40 +145,39 @@ def _projected(lines: list[Float64], rig: StereoRig) -> tuple[Float64, Float64]:
     return rig.project_raw(np.concatenate(lines)) if lines else (_NONE[:, :2], _NONE[:, :2])
 
 
-def _in_space(state: ThreadState, strips: list[Strip], rig: StereoRig) -> Iterator[Entry]:
+def _in_space(
+    state: ThreadState, arrows: Float64, slope: Float64, strips: list[Strip], rig: StereoRig
+) -> Iterator[Entry]:
     root = f"/rig/thread/{part(state.thread)}"
     lines, colors = [line for line, _ in strips], [color for _, color in strips]
-    yield f"{root}/curve", rr.LineStrips3D(lines, colors=colors, radii=-2.0)
-    control_points = samples = origins = arrows = _NONE
+    yield f"{root}/curve", rr.LineStrips3D(lines, colors=colors)
+    control_points = samples = _NONE
     reliable = np.empty((0, 3), np.uint8)
     if state.curve is not None:
         control_points = state.curve.control_points
         samples = nurbs.evaluate(state.curve, np.linspace(0, 1, len(state.sigma)))
         reliable = _reliability_colors(state.sigma * rig.focal / samples[:, 2], state.seen)
-        s = np.linspace(0, 1, _ARROWS)
-        origins = nurbs.evaluate(state.curve, s)
-        arrows = nurbs.derivative(state.curve, s) / _ARROWS
-    yield f"{root}/control_points", rr.Points3D(control_points, colors=RED, radii=-3.5)
-    tangent = rr.Arrows3D(origins=origins, vectors=arrows, colors=WHITE, radii=-0.75)
-    yield f"{root}/tangent", tangent
-    yield f"{root}/reliability", rr.Points3D(samples, colors=reliable, radii=-2.5)
+    yield f"{root}/control_points", rr.Points3D(control_points)
+    yield f"{root}/tangent", rr.Arrows3D(origins=arrows, vectors=slope / max(len(slope), 1))
+    yield f"{root}/reliability", rr.Points3D(samples, colors=reliable)
 
 
-def _motion(state: ThreadState, before: ThreadState | None, rig: StereoRig) -> Iterator[Entry]:
+def _motion(
+    state: ThreadState, before: ThreadState | None, arrows: Float64, slope: Float64, rig: StereoRig
+) -> Iterator[Entry]:
     """Where the curve will be in a tenth of a second; along itself its motion cannot be seen."""
-    origins = ahead = _NONE
+    ahead = _NONE
     speed = [np.nan, np.nan]
     seconds = 0.0 if before is None else (state.stamp.capture_ns - before.stamp.capture_ns) / 1e9
     if state.curve and before and before.curve and 0 < seconds < _LONGEST_STEP_S:
-        s = np.linspace(0, 1, _ARROWS)
-        origins, tangents = nurbs.evaluate(state.curve, s), nurbs.tangents(state.curve, s)
-        velocity = (origins - nurbs.evaluate(before.curve, s)) / seconds
-        velocity -= (velocity * tangents).sum(axis=1, keepdims=True) * tangents
+        velocity = (arrows - nurbs.evaluate(before.curve, _ARROWS_AT)) / seconds
+        along = (velocity * slope).sum(axis=1) / (slope * slope).sum(axis=1)
+        velocity -= along[:, None] * slope
         ahead = velocity * _AHEAD_S
         mm = np.linalg.norm(velocity, axis=1) * rig.metres_per_unit * 1000
         speed = [float(mm.mean()), float(mm.max())]
-    arrows = rr.Arrows3D(origins=origins, vectors=ahead, colors=TURQUOISE, radii=-1.0)
-    yield f"/rig/thread/{part(state.thread)}/velocity", arrows
+    motion = rr.Arrows3D(origins=arrows[: len(ahead)], vectors=ahead)
+    yield f"/rig/thread/{part(state.thread)}/velocity", motion
     yield f"/plots/{part(state.thread)}/speed", rr.Scalars(speed)
 
 
@@ -187,26 +215,27 @@ def _numbers(state: ThreadState, published_ns: int) -> dict[str, Any]:
     }
 
 
-def _strips(state: ThreadState, rig: StereoRig) -> list[Strip]:
+def _points(state: ThreadState) -> Float64:
+    return _NONE if state.curve is None else nurbs.evaluate(state.curve, _S)
+
+
+def _strips(state: ThreadState, points: Float64, rig: StereoRig) -> list[Strip]:
     """The curve in pieces: solid in the colour of its reliability where it is seen, dashed where it
     is not, gray where it is lost."""
     if state.curve is None:
         return []
-    s = np.linspace(0, 1, _DENSE)
-    points = nurbs.evaluate(state.curve, s)
     if state.status is Status.LOST:
         return [(piece, GRAY) for piece in _dashes(points)]
-    nearest = np.rint(s * (len(state.seen) - 1)).astype(int)
+    nearest = np.rint(_S * (len(state.seen) - 1)).astype(int)
     badness = _badness(state.sigma[nearest] * rig.focal / points[:, 2])
     level = np.minimum((badness * _LEVELS).astype(int), _LEVELS - 1)
     level[~state.seen[nearest]] = -1
-    edges = [0, *(np.flatnonzero(np.diff(level)) + 1), _DENSE]
-    colors = _ramp(np.linspace(0, 1, _LEVELS)).tolist()
+    edges = [0, *(np.flatnonzero(np.diff(level)) + 1), len(_S)]
     strips: list[Strip] = []
     for start, stop in pairwise(edges):
         piece = points[start : stop + 1]
         if level[start] >= 0:
-            strips.append((piece, colors[level[start]]))
+            strips.append((piece, _LEVEL_COLORS[level[start]]))
         else:
             strips += [(dash, AMBER) for dash in _dashes(piece)]
     return strips
@@ -234,3 +263,6 @@ def _ramp(badness: Float64) -> Image:
     """(K, 3) RGB from green over yellow to red."""
     places, colors = (0.0, 0.5, 1.0), np.array([GREEN, YELLOW, RED], float).T
     return np.stack([np.interp(badness, places, c) for c in colors], axis=1).astype(np.uint8)
+
+
+_LEVEL_COLORS: list[Color] = [tuple(color) for color in _ramp(np.linspace(0, 1, _LEVELS)).tolist()]

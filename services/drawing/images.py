@@ -66,8 +66,7 @@ def field(field: RidgeField, rig: StereoRig, level: Level) -> Iterator[Entry]:
         picture = unrectified(direction_image(vectors), rig, view)
         yield f"/rig/{view}/image/direction", jpeg(picture)
         if level == "full":
-            # A copy, because the segmenter uses its buffers again before they are written.
-            numbers = {"shape": vectors.shape, "vectors": vectors.copy()}
+            numbers = {"shape": vectors.shape, "vectors": vectors}
             yield f"/rig/{view}/field", values("RidgeField", numbers)
 
 
