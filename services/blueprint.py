@@ -13,19 +13,20 @@ from suturetrack.types import Float64
 PROCESSES = ("source", "segmenter", "tracker")
 _IN_DETAIL = ("tangent", "reliability", "velocity")
 _EYE = np.array([-0.7, -0.55, -0.75])
-"""Where the eye of the view of space is from its target, in distances of the thread."""
+"""Where the eye of the view of space is from the thread, in sizes of the thread: beside the cameras,
+and so near that the thread fills the view."""
 
 
-def blueprint(threads: Sequence[str], target: Float64) -> rrb.Blueprint:
+def blueprint(threads: Sequence[str], thread: Float64) -> rrb.Blueprint:
     """The layout for the given threads ("0" when there is none yet).
 
-    `target` is a (3,) point on the thread, or where one may be, in the rectified left frame.
+    `thread` are (n, 3) points around a thread, or where one may be, in the rectified left frame.
     """
     names = [part(thread) for thread in threads] or ["0"]
     return rrb.Blueprint(
         rrb.Tabs(
             rrb.Horizontal(
-                _scene(names, target), _plots(names), column_shares=[7, 3], name="Tracking"
+                _scene(names, thread), _plots(names), column_shares=[7, 3], name="Tracking"
             ),
             _curve(names),
             _segmentation(),
@@ -38,13 +39,11 @@ def blueprint(threads: Sequence[str], target: Float64) -> rrb.Blueprint:
     )
 
 
-def _scene(names: Sequence[str], target: Float64) -> rrb.Container:
+def _scene(names: Sequence[str], thread: Float64) -> rrb.Container:
     images = rrb.Horizontal(*(_view(view, "", "/curve", "/truth/**") for view in VIEWS))
-    # From the side, with the cameras at one edge and the thread at the other.
-    middle, distance = 0.7 * target, np.linalg.norm(target)
-    eye = rrb.EyeControls3D(
-        position=middle + distance * _EYE, look_target=middle, eye_up=(0, -1, 0)
-    )
+    low, high = thread.min(axis=0), thread.max(axis=0)
+    middle, size = (low + high) / 2, np.linalg.norm(high - low)
+    eye = rrb.EyeControls3D(position=middle + size * _EYE, look_target=middle, eye_up=(0, -1, 0))
     hidden = [f"- /rig/{view}/**" for view in VIEWS]
     hidden += [f"- /rig/thread/{name}/{part}" for name in names for part in _IN_DETAIL]
     shown = [f"+ /rig/{view}/image" for view in VIEWS]
@@ -62,11 +61,13 @@ def _plots(names: Sequence[str]) -> rrb.Container:
             origin="/plots", name="Status and events", contents=_each(names, "status", "event")
         ),
         _plot(
-            "Energies of the images (best: -1) and of the ends",
+            "Energy: left blue, right orange (best -1), ends violet",
             *_each(names, "energy/image", "energy/end", "energy/event/**"),
         ),
         _plot("Length [mm]", *_each(names, "length")),
-        _plot("Latency [ms]", "/plots/latency_ms/**"),
+        _plot(
+            "Latency [ms]: source blue, segmenter violet, tracker orange", "/plots/latency_ms/**"
+        ),
         row_shares=[3, 5, 5, 4],
     )
 
@@ -81,7 +82,7 @@ def _curve(names: Sequence[str]) -> rrb.Container:
         rrb.Vertical(
             _plot("Bending (no unit)", *_each(names, "energy/internal")),
             _plot("Control points", *_each(names, "control_points")),
-            _plot("Speed [mm/s]", *_each(names, "speed")),
+            _plot("Speed [mm/s]: mean turquoise, fastest orange", *_each(names, "speed")),
         ),
         column_shares=[3, 2],
         name="Curve",
@@ -123,18 +124,19 @@ def _parameters() -> rrb.Container:
 
 def _processes() -> rrb.Container:
     return rrb.Grid(
-        _plot("Rate [1/s]", "/plots/rate_hz/**"),
-        _plot("Latency from the release of the frame [ms]", "/plots/latency_ms/**"),
-        _plot("Frames dropped so far", "/plots/dropped/**"),
-        _plot("Memory [MB]", "/plots/memory_mb/**"),
+        _plot("Rate [1/s]", "/plots/rate_hz/**", legend=True),
+        _plot("Latency from the release of the frame [ms]", "/plots/latency_ms/**", legend=True),
+        _plot("Frames dropped so far", "/plots/dropped/**", legend=True),
+        _plot("Memory [MB]", "/plots/memory_mb/**", legend=True),
         grid_columns=2,
         name="Processes",
     )
 
 
-def _plot(name: str, *contents: str) -> rrb.TimeSeriesView:
-    legend = rrb.PlotLegend(rrb.Corner2D.LeftTop)
-    return rrb.TimeSeriesView(origin="/plots", name=name, contents=contents, plot_legend=legend)
+def _plot(name: str, *contents: str, legend: bool = False) -> rrb.TimeSeriesView:
+    # On a small plot a legend would cover the lines, so that its name tells the colours.
+    corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
+    return rrb.TimeSeriesView(origin="/plots", name=name, contents=contents, plot_legend=corner)
 
 
 def _view(view: str, *layers: str, name: str | None = None) -> rrb.Spatial2DView:

@@ -14,7 +14,6 @@ from services.blueprint import blueprint
 from services.columns import Columns
 from services.drawing import Entry, Level
 from services.messages import Forget, Health
-from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.types import (
@@ -49,7 +48,7 @@ class Writer:
         self._seeds: dict[str, Seed] = {}
         self._seeded: set[str] = set()
         self._true: set[str] = set()
-        self._target: Float64 | None = None
+        self._seen: Float64 | None = None
 
     def describe(self) -> None:
         """Writes what does not change: cameras, and the look of what was introduced so far."""
@@ -148,9 +147,8 @@ class Writer:
 
     def layout(self) -> rrb.Blueprint:
         """How the viewer shows the threads that were introduced so far."""
-        ahead = np.array([0.0, 0.0, 10 * self.rig.baseline])
-        target = ahead if self._target is None else self._target
-        return blueprint(list(self._statuses), target)
+        ahead = self.rig.baseline * np.array([[-2.0, -2.0, 8.0], [2.0, 2.0, 12.0]])
+        return blueprint(list(self._statuses), ahead if self._seen is None else self._seen)
 
     def write(
         self, stamp: Stamp | None, entries: Iterable[Entry], growth: int | None = None
@@ -209,9 +207,9 @@ class Writer:
         if state.thread not in self._statuses:
             self._statuses[state.thread] = None
             self.write_static(drawing.thread_style(state.thread))
-            self._target = None
-        if self._target is None and state.curve is not None:
-            self._target = nurbs.evaluate(state.curve, np.array([0.5]))[0]
+            self._seen = None
+        if self._seen is None and state.curve is not None:
+            self._seen = state.curve.control_points
             self.stream.send_blueprint(self.layout())
 
     def _tell(self, state: ThreadState) -> None:

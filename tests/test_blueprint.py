@@ -116,7 +116,7 @@ def test_every_view_shows_something_and_everything_is_shown(
 ) -> None:
     record_run(tmp_path, distorted_rig, curve)
     entities = {row["entity"] for row in RunFolder(tmp_path).rows("/**")}
-    layout = list(views(blueprint(["0"], np.array([0.0, 0.0, 200.0])).root_container))
+    layout = list(views(blueprint(["0"], _points(curve)).root_container))
     by_view = {f"{view.name} {view.contents}": shown(view, entities) for view in layout}
     assert all(by_view.values()), by_view
     unseen = entities - set().union(*by_view.values())

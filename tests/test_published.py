@@ -25,7 +25,9 @@ from services.tracker import TrackerConfig
 from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.types import ThreadState
+from suturetrack.initialization import Initialization, ViewGrowth
+from suturetrack.tracking import Tracker
+from suturetrack.types import Seed, ThreadState
 
 FRAMES = 4
 PROCESSES = ("source", "segmenter", "tracker")
@@ -76,13 +78,15 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Run:
     bus = Bus(hub.connect(), config.rig, "listener")
     listened = (topics.FRAME, topics.FIELD, topics.STATE, topics.TRUTH)
     readers = {topic.key: bus.every(topic) for topic in listened}
+    healths = bus.every(topics.HEALTH)
     with running(config, hub, seed):
         pass
     heard = {key: drained(reader) for key, reader in readers.items()}
     for topic in (topics.STATE, topics.TRUTH):
         heard[topic.key] = [scaled(m, 1 / rig.metres_per_unit) for m in heard[topic.key]]
-    bus.close()
     assert {key: len(messages) for key, messages in heard.items()} == dict.fromkeys(heard, FRAMES)
+    heard[topics.HEALTH.key] = drained(healths)
+    bus.close()
     return RunFolder(run_dir), heard, rig
 
 
@@ -205,6 +209,86 @@ def test_what_is_drawn_and_plotted_is_the_state(played: Run) -> None:
     tangents = nurbs.tangents(after, s)
     moved -= (moved * tangents).sum(axis=1, keepdims=True) * tangents
     assert np.allclose(velocity[2]["Arrows3D:vectors"], moved, atol=1e-4)
+
+
+def test_tangents_and_reliability_are_those_of_the_state(played: Run) -> None:
+    folder, heard, _ = played
+    for i, state in enumerate(heard[topics.STATE.key]):
+        assert state.curve is not None
+        arrows = rows(folder, "/rig/thread/0/tangent")[i]
+        s = np.linspace(0, 1, len(arrows["Arrows3D:vectors"]))
+        assert np.allclose(arrows["Arrows3D:origins"], nurbs.evaluate(state.curve, s), atol=1e-4)
+        slope = nurbs.derivative(state.curve, s)
+        assert np.allclose(len(s) * arrows["Arrows3D:vectors"], slope, rtol=1e-4, atol=1e-3)
+        samples = rows(folder, "/rig/thread/0/reliability")[i]
+        on_curve = nurbs.evaluate(state.curve, np.linspace(0, 1, len(state.sigma)))
+        assert np.allclose(samples["Points3D:positions"], on_curve, atol=1e-4)
+        gray = samples["Points3D:colors"] == (150 << 24 | 150 << 16 | 150 << 8 | 255)
+        assert np.array_equal(gray, ~state.seen)
+        points = rows(folder, "/rig/thread/0/control_points")[i]["Points3D:positions"]
+        assert np.allclose(points, state.curve.control_points, atol=1e-4)
+
+
+def test_the_growth_is_that_of_the_published_field(played: Run) -> None:
+    folder, heard, rig = played
+    footage, _ = open_input(InputConfig("stage:figure8-107"))
+    (seed,) = footage.seeds
+    again = Tracker(rig)
+    again.seed(Seed("0", pixel=seed))
+    field = heard[topics.FIELD.key][0]
+    found = again.step(field).initializations["0"]
+    assert isinstance(found, Initialization)
+    assert found.growth is not None
+    for k, view in enumerate(("left", "right")):
+        root = f"/rig/{view}/image/growth/0"
+        grown: ViewGrowth = getattr(found.growth, view)
+        rejected = [line for line, _ in grown.rejected]
+        for name, lines in (
+            *(("segments", grown.segments), ("merges", grown.merges), ("rejected", rejected)),
+        ):
+            (drawn,) = rows(folder, f"{root}/{name}")
+            strips = drawn["LineStrips2D:strips"]
+            for strip, line in zip(strips, lines, strict=True):
+                assert np.allclose(strip, rig.raw_pixels(line, right=k == 1), atol=1e-3)
+        reasons = [reason for _, reason in grown.rejected]
+        assert list(drawn.get("LineStrips2D:labels", ())) == reasons
+        (marks,) = rows(folder, f"{root}/marks")
+        expected = rig.raw_pixels(found.growth.marks[:, k], right=k == 1)
+        assert np.allclose(marks["Points2D:positions"], expected, atol=1e-3)
+        fronts = sorted(rows(folder, f"{root}/front"), key=lambda row: row["growth"])
+        reached = [np.count_nonzero(row["SegmentationImage:buffer"][0]) for row in fronts]
+        assert reached == sorted(reached)
+        assert reached[-1] == np.isfinite(grown.cost).sum() > 0
+        (picture,) = rows(folder, f"/rig/{view}/image/growth/field")
+        blob = np.asarray(picture["EncodedImage:blob"][0], np.uint8)
+        bright = np.asarray(cv2.imdecode(blob, cv2.IMREAD_COLOR)).max(axis=2).astype(float)
+        length = np.linalg.norm(getattr(field, view), axis=2)
+        assert np.corrcoef(bright.ravel(), length.ravel())[0, 1] > 0.8
+    (begun,) = rows(folder, "/rig/left/image/growth/0/seed")
+    assert np.allclose(begun["Points2D:positions"], [seed], atol=1e-3)
+    (words,) = rows(folder, "/log/initialization/0")
+    for said in (f"confidence {found.confidence:.2f}", *found.reasons):
+        assert said in words["TextDocument:text"][0]
+
+
+def test_process_plots_are_the_published_health_and_the_times_of_the_results(played: Run) -> None:
+    folder, heard, _ = played
+    for process in PROCESSES:
+        healths = [h for h in heard[topics.HEALTH.key] if h.process == process and h.stamp]
+        assert healths
+        for quantity in ("rate_hz", "dropped", "memory_mb"):
+            plotted = [
+                r["Scalars:scalars"][0] for r in rows(folder, f"/plots/{quantity}/{process}")
+            ]
+            assert plotted == [getattr(h, quantity) for h in healths], (quantity, process)
+        latencies = rows(folder, f"/plots/latency_ms/{process}")
+        assert [row["frame"] for row in latencies] == list(range(FRAMES))
+        assert all(row["Scalars:scalars"][0] > 0 for row in latencies)
+    plotted = [row["Scalars:scalars"][0] for row in latencies]
+    assert plotted == [recorded.latency_ms for recorded in folder.states()]
+    status = rows(folder, "/plots/0/status")
+    told = [row["StateChange:state"][0] for row in status]
+    assert told == [str(state.status) for state in heard[topics.STATE.key]]
 
 
 def test_the_moment_of_the_seed_is_marked(played: Run) -> None:

@@ -438,25 +438,72 @@ def writer(run: Path, limit: int = 0) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def test_a_killed_process_loses_at_most_a_second(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "seconds", [3.7, *(pytest.param(0.3 + 0.21 * k, marks=pytest.mark.long) for k in range(20))]
+)
+def test_a_killed_process_loses_at_most_a_second(tmp_path: Path, seconds: float) -> None:
     process = writer(tmp_path)
     assert process.stdout is not None
     written: list[tuple[int, float]] = []
     for line in process.stdout:
-        number, seconds = line.split()
-        written.append((int(number), float(seconds)))
-        if written[-1][1] > 3.7:
+        number, at = line.split()
+        written.append((int(number), float(at)))
+        if written[-1][1] > seconds:
             break
     os.kill(process.pid, signal.SIGKILL)
     for line in process.stdout:
-        number, seconds = line.split()
-        written.append((int(number), float(seconds)))
+        number, at = line.split()
+        written.append((int(number), float(at)))
     process.communicate()
     folder = RunFolder(tmp_path)
     logged = sorted(r["frame"] for r in rows(folder, "/log/source"))
     assert logged == list(range(len(logged)))
-    last = dict(written)[logged[-1]]
+    last = dict(written)[logged[-1]] if logged else 0.0
     assert written[-1][1] - last <= 1.0
+
+
+ENDING = """
+    import sys
+    from pathlib import Path
+    from services.service import ServiceConfig, run
+    from suturetrack.types import Stamp
+    from tests.conftest import make_rig
+
+    def body(service):
+        recorder = service.record(make_rig(), None)
+        service.ready()
+        for i in range(10_000):
+            service.finished(Stamp(i, i, i))
+            recorder.passed(Stamp(i, i, i), i)
+            print(i, flush=True)
+            if sys.argv[2] == "exception" and i == 40:
+                raise RuntimeError("out of thread")
+            if service.bus.stop.wait(0.01):
+                return
+
+    run("source", ServiceConfig(rig=sys.argv[3], run_dir=Path(sys.argv[1])), body)
+"""
+
+
+@pytest.mark.parametrize("end", ["SIGTERM", "SIGINT", "exception"])
+def test_a_process_that_ends_in_order_loses_nothing(tmp_path: Path, end: str) -> None:
+    command = [sys.executable, "-c", textwrap.dedent(ENDING), str(tmp_path), end, f"end-{end}"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if int(line) == 40 and end != "exception":
+            process.send_signal(getattr(signal, end))
+    last = int(line)
+    process.communicate()
+    assert last >= 40
+    folder = RunFolder(tmp_path)
+    assert folder.problems == []
+    assert folder.handled("source") == set(range(last + 1))
+    told = [r["TextLog:text"][0] for r in rows(folder, "/log/source")]
+    assert told == (["source: RuntimeError: out of thread"] if end == "exception" else [])
+    assert rows(folder, "/plots/rate_hz/source")
 
 
 def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
