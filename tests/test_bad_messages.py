@@ -48,11 +48,17 @@ def system(options: list[str], tmp_path_factory: pytest.TempPathFactory) -> Iter
         yield running
 
 
+@pytest.fixture
+def attacker(system: System) -> Iterator[Attacker]:
+    attacker = Attacker()
+    yield attacker
+    attacker.bus.close()
+
+
 class Attacker:
     """Sends to a rig whatever it likes."""
 
-    def __init__(self, system: System):
-        self._system = system
+    def __init__(self) -> None:
         self._transport = ZenohTransport(local_config(RIG, "stranger"))
         self.bus = Bus(self._transport, RIG, "stranger")
         self._healths = self.bus.every(topics.HEALTH)
@@ -75,8 +81,9 @@ class Attacker:
 
 
 @pytest.mark.parametrize("count", [100, pytest.param(10_000, marks=pytest.mark.long)])
-def test_bad_messages_are_counted_and_harm_nothing(system: System, count: int) -> None:
-    attacker = Attacker(system)
+def test_bad_messages_are_counted_and_harm_nothing(
+    system: System, attacker: Attacker, count: int
+) -> None:
     chance = np.random.default_rng(1)
     pids = {name: process.pid for name, process in system.processes().items()}
     system.until(attacker.heard_of_all)
@@ -111,7 +118,6 @@ def test_bad_messages_are_counted_and_harm_nothing(system: System, count: int) -
         assert grown < MOST_GROWTH_MB, process
     lines = [line for line in system.said.splitlines() if "refused" in line]
     assert 3 <= len(lines) <= 3 * (seconds + 2)
-    attacker.bus.close()
 
 
 def strangers(count: int) -> Iterator[Packet]:
@@ -126,10 +132,8 @@ def strangers(count: int) -> Iterator[Packet]:
         yield wire.encode(RidgeField(Stamp(2**62 + i, 2**62 - i, 2**62), whole, whole))
 
 
-def test_seeds_that_are_nowhere_are_answered(system: System) -> None:
-    attacker = Attacker(system)
+def test_seeds_that_are_nowhere_are_answered(system: System, attacker: Attacker) -> None:
     for packet in itertools.islice(malformed(topics.SEED.kind, np.random.default_rng(2)), 9):
         with pytest.raises(NoAnswer, match=r"\w"):
             attacker.ask("thread/0/seed", packet)
     system.until_tracking()
-    attacker.bus.close()

@@ -29,7 +29,7 @@ from tests.conftest import wait_until
 
 FRAMES = 10
 PROCESSES = {"source", "segmenter", "tracker"}
-STAGE = ("--source", "stage:figure8-107")
+STAGE = ("--source", "stage:figure8-107", "--loop", "30")
 
 
 def command(*arguments: object) -> list[str]:

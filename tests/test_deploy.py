@@ -1,0 +1,50 @@
+"""The units and configurations that are handed out fit the program."""
+
+from __future__ import annotations
+
+import importlib
+import shlex
+from pathlib import Path
+
+import pytest
+import tyro
+
+from services.cli import VERBS
+from services.zenoh_transport import load_config
+
+DEPLOY = Path(__file__).parents[1] / "services" / "deploy"
+OPTIONS = {"source": ["--source", "0,1", "--calibration", "rig.yaml"]}
+
+
+def started_by(unit: str) -> list[str]:
+    """The words of the command after the program's path."""
+    (line,) = [
+        line for line in (DEPLOY / unit).read_text().splitlines() if line.startswith("ExecStart=")
+    ]
+    return shlex.split(line)[1:]
+
+
+@pytest.mark.parametrize("process", ["source", "segmenter", "tracker"])
+def test_the_unit_of_a_process_starts_it_to_go_on_where_the_last_one_left_off(process: str) -> None:
+    words = [word.replace("%i", process) for word in started_by("suturetrack@.service")]
+    assert words[0] == process
+    assert words[-1] == "$OPTIONS"
+    verb = VERBS[process]
+    kind = getattr(importlib.import_module(verb.module), verb.config)
+    config = tyro.cli(kind, args=[*words[1:-1], *OPTIONS.get(process, [])])
+    assert config.service.zenoh == Path(f"/etc/suturetrack/{process}.json5")
+    assert config.service.resume == 1
+
+
+def test_the_unit_of_the_router_starts_it() -> None:
+    assert started_by("suturetrack-router.service") == [
+        *("router", "--zenoh", "/etc/suturetrack/router.json5")
+    ]
+    assert "router" in VERBS
+
+
+@pytest.mark.parametrize("path", sorted(DEPLOY.glob("*.json5")), ids=lambda path: path.stem)
+def test_configurations_are_whole(path: Path) -> None:
+    config = load_config(path)
+    assert config.get_json("scouting/multicast/enabled") == "false"
+    assert config.get_json("mode") == ('"router"' if path.stem == "router" else '"client"')
