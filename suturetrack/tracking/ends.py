@@ -104,6 +104,8 @@ def _outer_boundary(x: Float64, mean: Float64, least: Float64) -> float | None:
 
 # What the length of a thread may change by from one field to the next.
 _DRAWN_PX = 6.0
+# An end that is hidden steps off by at least this much before the curve's own.
+_CUT_PX = 3.0
 _SETTLING_S = 0.3
 _HELD_S = 1.5
 # A length that has kept within this part for so long is the thread's own.
@@ -117,8 +119,9 @@ class EndWatch:
     """Decides from field to field whether an end has moved, is hidden, or runs into something else.
 
     What one end loses and the other gains is the thread sliding along itself. A thread that is
-    suddenly shorter is hidden, one that is suddenly longer than it ever was has met something that
-    looks like it: its length is then held for a while, the more firmly the longer it was steady.
+    suddenly shorter at an end is hidden there, one that is suddenly longer than it ever was has met
+    something that looks like it: its length is then held for a while, the more firmly the longer it
+    was steady.
     """
 
     def __init__(self, length: float, now_ns: int) -> None:
@@ -181,7 +184,11 @@ class EndWatch:
         if total > max(self.length, self._longest) + slack:
             return [int(np.argmax(offsets))]
         if total < self.length - slack:
-            doubted = [end for end in (0, 1) if offsets[end] <= min(offsets) / 2]
+            doubted = [
+                end
+                for end, step in enumerate(shown)
+                if step.offset_px < -_CUT_PX and offsets[end] <= min(offsets) / 2
+            ]
         return [end for end in doubted if (now_ns - self._seen_ns[end]) * _NS < _HELD_S]
 
     def _remember(self, length: float, now_ns: int) -> None:
