@@ -76,9 +76,21 @@ def judge(
 _ORDINAL = ("first", "last")
 
 
-def clarity(chain: Chain) -> float:
-    """What the doubts about a chain leave of the confidence in it."""
-    return float(np.prod([rest for *_, rest in _distinct(chain)]))
+def clarity(chain: Chain, places: Float64 | None = None) -> float:
+    """What the doubts about a chain, or those near (k, 2) places, leave of the confidence in it."""
+    return float(
+        np.prod(
+            [
+                rest
+                for where, _, rest in _distinct(chain)
+                if places is None or _is_near(where, places)
+            ]
+        )
+    )
+
+
+def _is_near(where: Float64, places: Float64) -> bool:
+    return bool((np.linalg.norm(places - where, axis=1) <= _SAME_PLACE_PX).any())
 
 
 def _distinct(chain: Chain) -> list[tuple[Float64, str, float]]:

@@ -11,7 +11,7 @@ from suturetrack.initialization.growth import Chain, Thread, follow_thread, near
 from suturetrack.initialization.matching import Match, match
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.segments import Ridges
-from suturetrack.metrics import coverage
+from suturetrack.metrics import coverage, polyline_distances
 from suturetrack.types import Float64, RidgeField
 
 AGREED = 0.95
@@ -82,7 +82,7 @@ def find_thread(
         return first
     mirrored = match(right.chain, field.right, field.left, -nearest, -1)
     through_seed = np.linalg.norm(mirrored.pixels - seed, axis=1).min() <= config.snap_px
-    if through_seed and _worth(right, mirrored) > _worth(left, matched):
+    if through_seed and _worth(right, mirrored, matched) > _worth(left, matched, mirrored):
         return Hypothesis(left, right, mirrored, by_right=True)
     return first
 
@@ -94,10 +94,25 @@ def _agreement(one: Float64, other: Float64) -> float:
     return min(coverage(one, other, _NEAR_PX), coverage(other, one, _NEAR_PX))
 
 
-def _worth(thread: Thread, matched: Match) -> float:
+def _worth(thread: Thread, matched: Match, other: Match) -> float:
+    """How much speaks for the thread of one view where that of the other view runs another way.
+
+    Args:
+        thread: of one view.
+        matched: its counterpart in the other view.
+        other: the other view's thread, matched in the view of `thread`.
+    """
     unmatched = float(((matched.response < _UNMATCHED) & matched.inside).mean())
-    worth = np.count_nonzero(matched.inside) * clarity(thread.chain)
+    pixels = thread.chain.pixels
+    partings = np.r_[_partings(pixels, other.pixels), _partings(other.pixels, pixels)]
+    worth = np.count_nonzero(matched.inside) * clarity(thread.chain, partings)
     return float(worth * np.exp(-_UNMATCHED_PRICE * unmatched))
+
+
+def _partings(one: Float64, other: Float64) -> Float64:
+    """(k, 2) where the chain `one` leaves the other, or comes back to it."""
+    apart = polyline_distances(one, other) > _NEAR_PX
+    return one[:-1][apart[1:] != apart[:-1]]
 
 
 def _closest(pixels: Float64, place: Float64) -> int:

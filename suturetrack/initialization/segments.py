@@ -23,7 +23,7 @@ _SHORTEST = 4
 """Points; what is shorter says nothing about direction."""
 _NEAR_PX = 6.0
 """How near an end comes to the side of the segment that it runs into."""
-_GLANCING = 0.6
+_GLANCING = 0.3
 """Cosine of the angle below which an end runs into the side of a segment rather than along it."""
 _HEADING = 6
 """Points at an end that tell where it runs into another segment."""

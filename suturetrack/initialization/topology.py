@@ -18,6 +18,10 @@ Int64 = NDArray[np.int64]
 
 _CLEAR = 2
 """Points at the very end of a segment that the other ridges of a junction have drawn aside."""
+_HOOKED = 7
+"""Points at the end of a segment that a highlight beside it may have drawn aside."""
+_SHORT = 0.25
+"""Price of a merge with a segment too short to have a direction."""
 _TOUCHING_PX = 6.0
 """Ends this near over ridge belong together at any angle: a sharp bend."""
 _BRIDGE_SAMPLES = 12
@@ -98,6 +102,7 @@ def merge_ends(ridges: Ridges, config: InitializationConfig) -> Merged:
     _pair(partner, merges.pairs[order[merges.cost[order] < 1]])
     _exchange(partner, price)
     segments = _share(ridges.segments, partner, price)
+    _open_rings(partner, price)
     _pair(partner, merges.pairs[order[merges.touching[order]]])
     return Merged(segments, partner, price)
 
@@ -171,6 +176,32 @@ def _double(
         partner[i], partner[j] = j, i
 
 
+def _open_rings(partner: dict[int, int], price: dict[tuple[int, int], float]) -> None:
+    """Leads a strand that crosses a ring of segments through it: a thread has two ends."""
+    for start in list(partner):
+        if not _is_ring(start, partner):
+            continue
+        ring = _ends_from(start, partner)
+        ways = [
+            (price[i, a] + price.get((j, b), 2.0) - price[i, j] - price[a, b], i, j, a, b)
+            for i, j in ((e, partner[e]) for e in ring)
+            for a, b in partner.items()
+            if a not in ring and (i, a) in price
+        ]
+        added, i, j, a, b = min(ways, default=(np.inf, 0, 0, 0, 0))
+        if added < 2 * _FREE_END:
+            for one, other in ((i, a), (j, b)):
+                partner[one], partner[other] = other, one
+
+
+def _ends_from(start: int, partner: dict[int, int]) -> list[int]:
+    """The ends, two a segment, of the ring that leads through the end `start`."""
+    ends = [start, start ^ 1]
+    while partner[ends[-1]] != start:
+        ends += [partner[ends[-1]], partner[ends[-1]] ^ 1]
+    return ends
+
+
 def _is_ring(start: int, partner: dict[int, int]) -> bool:
     """Whether the segments joined to that of the end `start` lead back to it."""
     end = start ^ 1
@@ -212,57 +243,81 @@ def _pair(partner: dict[int, int], pairs: Int64) -> None:
 
 def _exchange(partner: dict[int, int], price: dict[tuple[int, int], float]) -> None:
     """Swaps partners as long as that lowers the total."""
+    within: dict[int, list[int]] = {}
+    for (i, j), cost in price.items():
+        if cost < 2 * _FREE_END:
+            within.setdefault(i, []).append(j)
 
-    def cost(i: int | None, j: int | None) -> float:
-        if i is None or j is None:
-            return 0.0 if i is j else _FREE_END
-        return min(price.get((i, j), 2.0), 2 * _FREE_END + 1e-3)
+    def paid(i: int) -> float:
+        return price[i, partner[i]] if i in partner else _FREE_END
+
+    def instead(left: list[int], taken: set[int]) -> tuple[float, list[tuple[int, int]]]:
+        """The cheapest pairs for ends that lose their partners, and what that costs."""
+        ways: list[tuple[float, list[tuple[int, int]]]] = [(_FREE_END * len(left), [])]
+        if len(left) == 2 and left[1] in within.get(left[0], ()):
+            ways.append((price[left[0], left[1]], [(left[0], left[1])]))
+        if len(left) == 1:
+            free = [k for k in within.get(left[0], ()) if k not in partner and k not in taken]
+            ways += [(price[left[0], k] - _FREE_END, [(left[0], k)]) for k in free]
+        return min(ways)
 
     improved = True
     while improved:
         improved = False
         for i, j in list(price):
-            a, b = partner.get(i), partner.get(j)
-            if a == j or price[i, j] >= 1:
+            if partner.get(i) == j or price[i, j] >= 2 * _FREE_END:
                 continue
-            if price[i, j] + cost(a, b) < cost(i, a) + cost(j, b) - 1e-9:
-                partner[i], partner[j] = j, i
-                for one, other in ((a, b), (b, a)):
-                    if one is None:
-                        continue
-                    if other is not None and price.get((one, other), 2.0) < 1:
-                        partner[one] = other
-                    else:
-                        partner.pop(one, None)
+            left = [partner[end] for end in (i, j) if end in partner]
+            cost, pairs = instead(left, {i, j})
+            if price[i, j] + cost < paid(i) + paid(j) - 1e-9:
+                for end in left:
+                    del partner[end]
+                for one, other in ((i, j), *pairs):
+                    partner[one], partner[other] = other, one
                 improved = True
 
 
 def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
     """Prices every pair of ends within reach: whether one smooth curve runs through both segments,
     over ridge, at one strength."""
-    arms = [a for s in ridges.segments for a in (_arm(s), _arm(s[::-1]))]
-    positions = np.array([a[0] for a in arms])
-    near = np.array([ridges.sample(a).mean() for a in arms])
+    looks = [
+        [a for s in ridges.segments for a in (_arm(s, clear), _arm(s[::-1], clear))]
+        for clear in (_CLEAR, _HOOKED)
+    ]
+    positions = np.array([a[0] for a in looks[0]])
+    near = np.array([ridges.sample(a).mean() for a in looks[0]])
     # A highlight at a junction fades one arm of a segment, and not the segment.
     whole = np.repeat([np.median(ridges.sample(s)) for s in ridges.segments], 2)
+    short = np.repeat([max(1 - len(s) / ARM, 0.0) for s in ridges.segments], 2)
     pairs = cKDTree(positions).query_pairs(2 * config.gap_px, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
     cost, touching = np.empty(len(pairs)), np.zeros(len(pairs), bool)
     for k, (i, j) in enumerate(pairs):
-        misfit, swing, bridge = _common_curve(arms[i], arms[j])
         distance = float(np.linalg.norm(positions[j] - positions[i]))
-        seen, weakest = _evidence(ridges, bridge, config)
-        missing = (1 - seen) * distance / config.gap_px
+        shape, weakest = _bridge_price(looks[0][i], looks[0][j], ridges, config)
+        if shape > _FREE_END and distance < 2 * _TOUCHING_PX:
+            shape = min(shape, _bridge_price(looks[1][i], looks[1][j], ridges, config)[0])
         ratio = min(abs(float(np.log(s[i] / s[j]))) for s in (near, whole))
-        cost[k] = (
-            misfit + _SWING * swing**2 + missing + 0.1 * distance / config.gap_px + 0.25 * ratio**2
-        )
+        cost[k] = shape + 0.25 * ratio**2 + _SHORT * max(short[i], short[j])
         touching[k] = distance < _TOUCHING_PX and weakest >= config.low
     return Merge(pairs, cost, touching)
 
 
-def _arm(segment: Float64) -> Float64:
-    return segment[min(_CLEAR, len(segment) // 4) : ARM]
+def _arm(segment: Float64, clear: int) -> Float64:
+    first = min(clear, len(segment) // 4)
+    return segment[first : first + ARM - _CLEAR]
+
+
+def _bridge_price(
+    one: Float64, other: Float64, ridges: Ridges, config: InitializationConfig
+) -> tuple[float, float]:
+    """What a smooth curve through two arms costs by its shape and the ridge below it, and the least
+    ||V|| between them."""
+    misfit, swing, bridge = _common_curve(one, other)
+    distance = float(np.linalg.norm(other[0] - one[0]))
+    seen, weakest = _evidence(ridges, bridge, config)
+    missing = (1 - seen) * distance / config.gap_px
+    return misfit + _SWING * swing**2 + missing + 0.1 * distance / config.gap_px, weakest
 
 
 def _common_curve(one: Float64, other: Float64) -> tuple[float, float, Float64]:
