@@ -20,13 +20,15 @@ import numpy as np
 from suturetrack.kernels.ridge import gaussian_taps
 from suturetrack.types import Float64, Image
 
-SIGMAS = (1.2, 2.4, 4.8)
-"""Scales at which a thread is looked for, px."""
+SIGMAS = (1.2, 2.4, 4.8, 9.6)
+"""Scales at which a thread is looked for, px: the first one in the image and its halves."""
 GRAY = np.array([29.0, 150.0, 77.0]) / 256
 """The usual weights of blue, green and red, in 256ths."""
 
 _WINDOW_PX = 64
 _SNAP_PX = 8
+# Fewest pixels of a halved image within which a ridge is looked for.
+_LEAST_SNAP_PX = 2
 _STARTS = 4
 _ROUNDS = 2
 _SHORTEST_PX = 20
@@ -36,6 +38,10 @@ _LEAST_SCORE = 1.9
 _FLOOR = 1.0
 # Second derivative across the edge of a shadow, as a share of the brightness.
 _SHADOW = 0.05
+# Scales that show the thread by less than this share of the clearest one are too small or too large.
+_CLEAR = 0.7
+# Of the scale that responds most, the share at which the middle is seen best.
+_BELOW = 0.8
 # A mix that is not better than gray by this factor is not worth its noise.
 _WORTH = 1.1
 # Along a curve: how many windows are looked at, and half their width.
@@ -97,23 +103,25 @@ def contrast_at(image: Image, pixel: tuple[float, float]) -> Contrast | None:
         image: (H, W, 3) BGR or (H, W) gray, uint8.
         pixel: (u, v) in that image.
     """
-    crop, seed = _window(image, pixel)
-    found = []
-    for sigma in SIGMAS:
-        scene = _Scene.of(crop, sigma)
-        ridges = _ridges_near(scene, seed)
-        if ridges:
-            weights, ridge = max(ridges, key=lambda r: _score(scene, r[0], r[1], scene.nuisance))
-            if _score(scene, weights, ridge, scene.clutter) >= _LEAST_SCORE:
-                found.append((float(np.median(ridge.across(scene) @ weights)), sigma, ridge))
+    shown = [_shown(image, pixel, octave) for octave in range(len(SIGMAS))]
+    found = [s for s in shown if s is not None and s.score >= _LEAST_SCORE]
     if not found:
         return None
-    # The response is strongest where sigma is half the width; the middle is seen best below that.
-    # Of scales that respond alike the smaller one keeps neighbours apart.
-    _, sigma, ridge = max(found, key=lambda f: f[0] * f[1] ** -0.4)
-    sigma = max(SIGMAS[0], 0.6 * sigma)
+    clearest = max(s.score for s in found)
+    # The response is strongest where sigma is half the width. Of scales that respond alike the
+    # smaller one keeps neighbours apart.
+    best = max(
+        (s for s in found if s.score >= _CLEAR * clearest),
+        key=lambda s: s.response * SIGMAS[s.octave] ** -0.4,
+    )
+    # The middle is seen best below that scale: in the image that is twice as large.
+    octave, sigma, zoom = 0, SIGMAS[0], 1
+    if best.octave:
+        octave, sigma, zoom = best.octave - 1, _BELOW * SIGMAS[1], 2
+    crop, seed = _window(*_shrunk(image, pixel, octave), zoom * _WINDOW_PX)
     scene = _Scene.of(crop, sigma)
-    return _contrast(scene.clutter, ridge.across(scene), sigma, channel_means(image))
+    across = _Ridge(zoom * best.ridge.pixels + seed, best.ridge.normals).across(scene)
+    return _contrast(scene.clutter, across, sigma * 2**octave, channel_means(image))
 
 
 def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
@@ -138,6 +146,40 @@ def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
         clutter.append(scene.clutter)
     middle = np.concatenate(across)
     return _contrast(np.mean(clutter, axis=0), middle, sigma, channel_means(image))
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """What one scale shows of the thread at the seed."""
+
+    octave: int
+    """How often the image was halved."""
+    ridge: _Ridge
+    """In pixels of that image, from the seed."""
+    score: float
+    response: float
+    """Length of the second derivative across, over the channels."""
+
+
+def _shown(image: Image, pixel: tuple[float, float], octave: int) -> _Shown | None:
+    """The ridge that stands out most near the seed, in the image halved `octave` times."""
+    crop, seed = _window(*_shrunk(image, pixel, octave))
+    scene = _Scene.of(crop, SIGMAS[0])
+    ridges = _ridges_near(scene, seed, max(_SNAP_PX / 2**octave, _LEAST_SNAP_PX))
+    if not ridges:
+        return None
+    weights, ridge = max(ridges, key=lambda r: _score(scene, r[0], r[1], scene.nuisance))
+    response = float(np.linalg.norm(np.median(ridge.across(scene), axis=0)))
+    score = _score(scene, weights, ridge, scene.clutter)
+    return _Shown(octave, _Ridge(ridge.pixels - seed, ridge.normals), score, response)
+
+
+def _shrunk(image: Image, pixel: tuple[float, float], octave: int) -> tuple[Image, Float64]:
+    """The image halved `octave` times, and where the pixel is in it."""
+    height, width = image.shape[:2]
+    size = max(width >> octave, 1), max(height >> octave, 1)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if octave else image
+    return small, (np.array(pixel) + 0.5) * np.array(size) / (width, height) - 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,18 +241,19 @@ def _window(
     return image[top : v + half, left : u + half], np.array(pixel) - (left, top)
 
 
-def _starts(scene: _Scene, seed: Float64) -> list[tuple[int, int]]:
+def _starts(scene: _Scene, seed: Float64, reach: float) -> list[tuple[int, int]]:
     """(v, u) of pixels near the seed whose second derivatives are least like the nuisance."""
     height, width = scene.hessian.shape[1:3]
+    whole = math.ceil(reach)
     v, u = (
-        np.mgrid[-_SNAP_PX : _SNAP_PX + 1, -_SNAP_PX : _SNAP_PX + 1]
+        np.mgrid[-whole : whole + 1, -whole : whole + 1]
         + np.rint(seed[::-1]).astype(int)[:, None, None]
     )
-    near = (np.hypot(u - seed[0], v - seed[1]) <= _SNAP_PX) & (u >= 0) & (v >= 0)
+    near = (np.hypot(u - seed[0], v - seed[1]) <= reach) & (u >= 0) & (v >= 0)
     near &= (u < width) & (v < height)
     v, u = v[near], u[near]
     unlike = _most_unlike(scene, v, u)[0]
-    unlike *= np.exp(-((u - seed[0]) ** 2 + (v - seed[1]) ** 2) / _SNAP_PX**2)
+    unlike *= np.exp(-((u - seed[0]) ** 2 + (v - seed[1]) ** 2) / reach**2)
     return [(int(v[i]), int(u[i])) for i in _peaks(unlike, v, u, apart=2)]
 
 
@@ -234,10 +277,10 @@ def _most_unlike(scene: _Scene, v: Float64, u: Float64) -> tuple[Float64, Float6
     return unlike[best], across[best]
 
 
-def _ridges_near(scene: _Scene, seed: Float64) -> list[tuple[Float64, _Ridge]]:
+def _ridges_near(scene: _Scene, seed: Float64, reach: float) -> list[tuple[Float64, _Ridge]]:
     """Ridges near the seed, each with the mix that suits it."""
     ridges: list[tuple[Float64, _Ridge]] = []
-    for start in _starts(scene, seed):
+    for start in _starts(scene, seed, reach):
         offsets = [ridge.pixels - start[::-1] for _, ridge in ridges]
         if not any((np.abs(offset).max(1) <= 1).any() for offset in offsets):
             followed = _follow(scene, start)

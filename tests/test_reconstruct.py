@@ -97,6 +97,19 @@ def test_an_area_and_a_laser_spot_give_the_same_curve(
     assert curve_error(dense(curve_in(config.output)), dense(curve)).mean < 0.3
 
 
+def test_a_wide_thread_is_found_in_enlarged_images(
+    pair: tuple[Image, Image, ReconstructConfig], curve: Nurbs
+) -> None:
+    left, right, config = pair
+    assert config.seed is not None
+    for times in (3, 5):
+        size = 640 * times, 480 * times
+        write(config, *(cv2.resize(i, size, interpolation=cv2.INTER_CUBIC) for i in (left, right)))
+        u, v = ((x + 0.5) * times - 0.5 for x in config.seed)
+        run(replace(config, scale=float(times), seed=(u, v)))
+        assert curve_error(dense(curve_in(config.output)), dense(curve)).mean < 0.3
+
+
 def test_a_seed_is_given_in_one_way(pair: tuple[Image, Image, ReconstructConfig]) -> None:
     config = pair[2]
     for wrong in (replace(config, seed=None), replace(config, laser=True)):

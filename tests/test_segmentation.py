@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import expit
 
 from suturetrack.camera import StereoRig
 from suturetrack.contrast import GRAY, SIGMAS, contrast_at
@@ -64,7 +65,7 @@ def line_image(angle: float, width: float = 2.0, dark: bool = True, size: int = 
     """A soft straight thread through the middle of a gray image."""
     v, u = np.mgrid[:size, :size] - (size - 1) / 2
     distance = np.abs(np.cos(angle) * v - np.sin(angle) * u)
-    share = 1 / (1 + np.exp(4 * (distance - width / 2)))
+    share = expit(-4 * (distance - width / 2))
     return np.rint(150 + (-90 if dark else 90) * share).astype(np.uint8)
 
 
@@ -421,10 +422,28 @@ def test_learned_contrast_stays_where_it_was_without_adaptation(scene: Scene) ->
 
 
 def test_a_wide_thread_gets_a_wide_filter() -> None:
-    for width, lowest, highest in ((1.5, 1.2, 1.2), (10.0, 2.0, 4.0)):
-        contrast = contrast_at(line_image(0.3, width, size=161), (80.0, 80.0))
+    for width, lowest, highest in (
+        (1.5, 1.2, 1.2),
+        (10.0, 2.0, 4.0),
+        (13.0, 3.0, 6.0),
+        (20.0, 5.0, 9.0),
+    ):
+        contrast = contrast_at(line_image(0.3, width, size=641), (320.0, 320.0))
         assert contrast is not None
         assert lowest <= contrast.sigma <= highest
+
+
+def test_an_enlarged_picture_shows_the_same_thread(scene: Scene) -> None:
+    image, pixel = scene.render(0)[0], np.array(scene.seed_pixel())
+    small = contrast_at(image, (pixel[0], pixel[1]))
+    assert small is not None
+    for times in (4, 6):
+        large = cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
+        u, v = (pixel + 0.5) * times - 0.5
+        found = contrast_at(large, (u, v))
+        assert found is not None
+        assert 0.35 < found.sigma / (times * small.sigma) < 1.7
+        assert small.stands_out(found.weights) > 0.8 * small.stands_out(small.weights)
 
 
 @pytest.mark.parametrize("channel", ["learned", "gray", "red"])
