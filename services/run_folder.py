@@ -102,7 +102,8 @@ class RunFolder:
 
     def truths(self) -> list[Truth]:
         """Where the synthetic threads really were, by frame and thread; empty for real scenes."""
-        truths = self._parsed(self.rows("/rig/truth/**"), _truth, "true threads")
+        rows = (row for row in self.rows("/rig/truth/**") if "frame" in row)
+        truths = self._parsed(rows, _truth, "true threads")
         return sorted(truths, key=lambda t: (t.stamp.frame, t.thread))
 
     def requests(self, process: str) -> list[tuple[int, Request]]:

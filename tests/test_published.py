@@ -150,6 +150,7 @@ def test_states_and_truths_are_those_published(played: Run) -> None:
     for recorded, state in zip(folder.states(), heard[topics.STATE.key], strict=True):
         same_state(recorded.state, state)
     truths = zip(folder.truths(), heard[topics.TRUTH.key], strict=True)
+    assert folder.problems == []
     for truth, sent in truths:
         assert (truth.stamp, truth.thread) == (sent.stamp, sent.thread)
         assert np.allclose(truth.points, sent.points, atol=1e-4)
