@@ -6,12 +6,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.progress import track
 
@@ -29,7 +29,10 @@ from suturetrack.types import InputError, Seed, Stamp, StereoFrame
 
 _RIG = "bench-recording"
 _LEVELS: tuple[Level, ...] = ("light", "full")
+_Key = tuple[Level | None, str]
+"""Level and process."""
 _PROCESSES = ("source", "segmenter", "tracker")
+_RATE_HZ = 30.0
 _LONGEST_S = 300.0
 
 
@@ -42,7 +45,7 @@ class RecordingBench:
     frames: int = 150
     """Frames of each run."""
     repeats: int = 2
-    """Lock-step runs without a recording and at each level, taken in turns."""
+    """Runs without a recording and at each level, lock-step and at 30 Hz, taken in turns."""
 
 
 @dataclass(frozen=True)
@@ -64,16 +67,21 @@ class Row:
     """The same without a recording, in the same benchmark."""
     ratio: float
     """Recorded over unrecorded rate; 1 where recording costs nothing."""
+    paced_hz: float
+    """The best rate of this process when frames are released at 30 Hz, recorded."""
+    unrecorded_paced_hz: float
+    """The same without a recording."""
 
 
 def run(config: RecordingBench, console: Console) -> list[Row]:
     """Prints a row a process and level."""
-    costs = {(level, name): cost for level in _LEVELS for name, cost in _costs(config, level)}
+    alone = {(level, name): cost for level in _LEVELS for name, cost in costs(config, level)}
     cases = [level for _ in range(config.repeats) for level in (None, *_LEVELS)]
-    best: dict[tuple[Level | None, str], float] = {}
-    for level in track(cases, "Lock-step", console=console, transient=True):
-        for name, rate_hz in _rates(config, level).items():
-            best[level, name] = max(rate_hz, best.get((level, name), 0.0))
+    best, paced = defaultdict[_Key, float](float), defaultdict[_Key, float](float)
+    for level in track(cases, "Lock-step and at 30 Hz", console=console, transient=True):
+        for rates, lockstep in ((best, True), (paced, False)):
+            for name, rate_hz in _rates(config, level, lockstep=lockstep).items():
+                rates[level, name] = max(rate_hz, rates[level, name])
     table = [
         Row(
             level,
@@ -81,25 +89,29 @@ def run(config: RecordingBench, console: Console) -> list[Row]:
             cost.loop_ms,
             cost.thread_ms,
             cost.kilobytes,
-            cost.kilobytes * 30 / 1e3,
+            cost.kilobytes * _RATE_HZ / 1e3,
             best[level, name],
             best[None, name],
             best[level, name] / best[None, name],
+            paced[level, name],
+            paced[None, name],
         )
-        for (level, name), cost in costs.items()
+        for (level, name), cost in alone.items()
     ]
     report.print_rows(console, f"Recording, {config.scenario}", table)
     return table
 
 
 @dataclass(frozen=True)
-class _Cost:
+class Cost:
+    """What one frame of a process costs; see `Row`."""
+
     loop_ms: float
     thread_ms: float
     kilobytes: float
 
 
-def _costs(config: RecordingBench, level: Level) -> Iterator[tuple[str, _Cost]]:
+def costs(config: RecordingBench, level: Level) -> Iterator[tuple[str, Cost]]:
     """What one frame of each process costs, measured within this process."""
     scene = open_scene(config.scenario)
     for name, hand_over in _loops(scene, config.frames).items():
@@ -111,12 +123,12 @@ def _costs(config: RecordingBench, level: Level) -> Iterator[tuple[str, _Cost]]:
                 began = time.perf_counter()
                 call(recorder)
                 loop_s += time.perf_counter() - began
-                time.sleep(0.005)
+                time.sleep(max(0.0, began + 1 / _RATE_HZ - time.perf_counter()))
             recorder.close()
             thread_s = time.process_time() - time.thread_time() - thread_s
             size = (Path(folder) / f"{name}.rrd").stat().st_size - empty_bytes
             count = len(hand_over)
-            yield name, _Cost(1e3 * loop_s / count, 1e3 * thread_s / count, size / 1e3 / count)
+            yield name, Cost(1e3 * loop_s / count, 1e3 * thread_s / count, size / 1e3 / count)
 
 
 def _loops(scene: Scene, frames: int) -> dict[str, list[Callable[[Recorder], None]]]:
@@ -126,7 +138,7 @@ def _loops(scene: Scene, frames: int) -> dict[str, list[Callable[[Recorder], Non
     tracker.seed(seed)
     loops: dict[str, list[Callable[[Recorder], None]]] = {name: [] for name in _PROCESSES}
     for i in range(min(frames, 30)):
-        frame = StereoFrame(Stamp(i, round(i * 1e9 / 30), time.time_ns()), *scene.render(i))
+        frame = StereoFrame(Stamp(i, round(i * 1e9 / _RATE_HZ), time.time_ns()), *scene.render(i))
         if i == 0:
             segmenter.learn(frame, seed)
         field = segmenter.step(frame)
@@ -137,10 +149,10 @@ def _loops(scene: Scene, frames: int) -> dict[str, list[Callable[[Recorder], Non
     return {name: calls * max(1, frames // 30) for name, calls in loops.items()}
 
 
-def _rates(config: RecordingBench, level: Level | None) -> dict[str, float]:
-    """Frames a second of each process in a lock-step run of real processes."""
+def _rates(config: RecordingBench, level: Level | None, *, lockstep: bool) -> dict[str, float]:
+    """Frames a second of each process in a run of real processes, lock-step or at 30 Hz."""
     seed = open_scene(config.scenario).seed_pixel(0)
-    shared = ["--rig", _RIG, "--lockstep"]
+    shared = ["--rig", _RIG, *(["--lockstep"] if lockstep else [])]
     with ExitStack() as stack:
         if level is not None:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="suturetrack-"))
@@ -176,6 +188,7 @@ def _rates(config: RecordingBench, level: Level | None) -> dict[str, float]:
         while (health := healths.get(0.3)) is not None:
             last[health.process] = health
     done = [h.frames for h in last.values()]
-    if np.min(done, initial=config.frames) < config.frames or set(last) != set(_PROCESSES):
+    least = config.frames if lockstep else 2
+    if set(last) != set(_PROCESSES) or min(done) < least:
         raise InputError(f"bench recording: a run did {done} of {config.frames} frames")
     return {name: health.run_rate_hz for name, health in last.items()}
