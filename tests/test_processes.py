@@ -15,21 +15,22 @@ import cv2
 import psutil
 import pytest
 
-from services import topics
+from services import launch, service, topics
 from services.bus import Bus
 from services.export import ExportConfig
 from services.export import run as export
 from services.run_folder import RunFolder
 from services.service import ServiceConfig
+from services.sources import InputConfig
 from services.zenoh_transport import ZenohTransport, local_config
 from suturetrack.calibration import save_calibration
 from suturetrack.stage import open_scene
-from suturetrack.types import Status, ThreadState
+from suturetrack.types import InputError, Status, ThreadState
 from tests.conftest import wait_until
 
 FRAMES = 10
 PROCESSES = {"source", "segmenter", "tracker"}
-STAGE = ("--source", "stage:figure8-107", "--loop", "30")
+STAGE = ("--source", "stage:figure8-107", "--loop", "30", "--fps", "5")
 
 
 def command(*arguments: object) -> list[str]:
@@ -213,15 +214,12 @@ def test_two_runs_at_once_keep_apart_and_a_name_is_used_once(
     first = start("run", *STAGE, "--run-dir", tmp_path / "a", "--rig", "bench")
     wait_until(lambda: len(sockets()) == 4)
     second = start(*run_pairs(pairs, tmp_path / "c"))
-    refused = start("run", *STAGE, "--run-dir", tmp_path / "b", "--rig", "bench")
-    source = start("source", *STAGE, "--rig", "bench")
-    _, err = refused.communicate(timeout=30)
-    assert refused.returncode == 1
-    assert "rig 'bench' runs already" in err
+    again = ServiceConfig("bench", run_dir=tmp_path / "b")
+    with pytest.raises(InputError, match="rig 'bench' runs already"):
+        launch.run(launch.RunConfig(InputConfig(STAGE[1]), again))
     assert not (tmp_path / "b").exists()
-    _, err = source.communicate(timeout=30)
-    assert source.returncode == 1
-    assert "a process named 'source' is running already" in err
+    with pytest.raises(InputError, match="a process named 'source' is running already"):
+        service.run("source", again, lambda _: None)
     _, err = second.communicate(timeout=60)
     assert second.returncode == 0, err
     first.terminate()

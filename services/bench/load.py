@@ -87,6 +87,10 @@ class Row:
     """Of all processes together, at the end."""
     memory_percent_per_10_min: float
     """Its growth, by a line through the second half; nan after less than a minute."""
+    source_mb_per_10_min: float
+    """The same growth process by process, in MB."""
+    segmenter_mb_per_10_min: float
+    tracker_mb_per_10_min: float
 
 
 def run(config: LoadBench, console: Console) -> list[Row]:
@@ -125,7 +129,7 @@ class _Watch:
 
     def __init__(self, system: System):
         self.seen: list[tuple[int, int, int]] = []
-        self.memory: list[tuple[float, float]] = []
+        self.memory: list[tuple[float, dict[str, float]]] = []
         self._system = system
         self._healths = system.client.bus.every(topics.HEALTH)
         self.healths: dict[str, Health] = {}
@@ -139,10 +143,11 @@ class _Watch:
 
     def glance(self) -> None:
         """Notes the memory and the newest heartbeats."""
-        processes = self._system.processes().values()
+        processes = self._system.processes().items()
         with suppress(psutil.NoSuchProcess):
-            used = sum(process.memory_info().rss for process in processes)
-            self.memory.append((time.monotonic(), used / 1e6))
+            used = {name: process.memory_info().rss / 1e6 for name, process in processes}
+            if len(used) == len(ROLES):
+                self.memory.append((time.monotonic(), used))
         while (health := self._healths.get(0)) is not None:
             self.healths[health.process] = health
         time.sleep(0.5)
@@ -187,6 +192,8 @@ def _row(load: str, fps: float, watch: _Watch, from_ns: int, missed: int) -> Row
     duration_s = (arrived[-1] - arrived[0]) / 1e9
     asked = int(frames[-1] - frames[0])
     healths = [watch.healths[name] for name in ROLES]
+    memory_mb = sum(watch.memory[-1][1].values())
+    growth_mb = {name: _growth_mb(watch.memory, name) for name in ROLES}
     return Row(
         load=load,
         asked_hz=fps,
@@ -198,15 +205,18 @@ def _row(load: str, fps: float, watch: _Watch, from_ns: int, missed: int) -> Row
         latency_max_ms=float(latency.max() / 1e6),
         skipped=sum(health.dropped for health in healths),
         missed=missed,
-        memory_mb=watch.memory[-1][1],
-        memory_percent_per_10_min=_growth(watch.memory),
+        memory_mb=memory_mb,
+        memory_percent_per_10_min=100 * sum(growth_mb.values()) / memory_mb,
+        source_mb_per_10_min=growth_mb["source"],
+        segmenter_mb_per_10_min=growth_mb["segmenter"],
+        tracker_mb_per_10_min=growth_mb["tracker"],
     )
 
 
-def _growth(memory: list[tuple[float, float]]) -> float:
-    """Percent in ten minutes, by a line through the second half."""
-    times, used = np.array(memory[len(memory) // 2 :]).T
+def _growth_mb(memory: list[tuple[float, dict[str, float]]], process: str) -> float:
+    """Of a process in ten minutes, by a line through the second half."""
+    later = memory[len(memory) // 2 :]
+    times, used = np.array([(when, mb[process]) for when, mb in later]).T
     if times[-1] - times[0] < _LEAST_FOR_GROWTH_S:
         return float("nan")
-    slope = float(np.polyfit(times - times[0], used, 1)[0])
-    return 100 * 600 * slope / float(used.mean())
+    return 600 * float(np.polyfit(times - times[0], used, 1)[0])
