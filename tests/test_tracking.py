@@ -124,6 +124,16 @@ def test_another_tracker_is_not_kept_from_a_thread_by_a_bad_last_state(rig: Ster
     assert error(states[-1], points).rms < 0.1
 
 
+def test_a_jump_of_the_camera_does_not_lose_the_thread(rig: StereoRig) -> None:
+    truths = [thread(i / FPS) for i in range(20)]
+    jump = np.array([28.0, -24.0, 0.0]) / rig.focal
+    truths[10:] = [points + jump * points[:, 2].mean() for points in truths[10:]]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    assert all(state.status is Status.TRACKING for state in states)
+    assert error(states[10], truths[10]).largest < 1.0
+
+
 def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:
     truths = [thread(i / FPS) for i in range(30)]
     fields = []

@@ -11,6 +11,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.tracking import gauss_newton, paper
+from suturetrack.tracking.alignment import shifted
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange
 from suturetrack.tracking.ends import EndWatch, doubled_ends, find_end
@@ -32,6 +33,7 @@ from suturetrack.types import Bool, Nurbs, RidgeField, Status, ThreadState
 _NS = 1e-9
 # Searches, in units of the first: tried where less than the second is seen, taken if they show more.
 _WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
+_ENOUGH, _GAIN = 0.97, 0.02
 _DROP = 0.01
 _RETRY = 5
 # A thread found again has the length that it had, to this part.
@@ -234,17 +236,21 @@ class Follower:
         """Looks further away for what was seen before, and now and then for what is hidden."""
         levels, config = self.model.levels, self.config
 
-        def fitted(reach_px: float) -> Evidence:
+        def fitted(start: Nurbs, reach_px: float) -> Evidence:
             return Evidence.of(
-                gauss_newton.fit(predicted, field, self.rig, levels, reach_px, config, neighbours)
+                gauss_newton.fit(start, field, self.rig, levels, reach_px, config, neighbours)
             )
 
-        best = fitted(config.search_px)
+        best = fitted(predicted, config.search_px)
         usual = 1.0 if field.stamp.frame % _RETRY == 0 else self._share - _DROP
+        if best.share < min(_ENOUGH, usual):
+            jumped = fitted(shifted(predicted, field, self.rig, levels), config.search_px)
+            if jumped.share > best.share + _GAIN:
+                best = jumped
         for times, enough, gain in _WIDER:
             if best.share >= min(enough, usual):
                 break
-            tried = fitted(times * config.search_px)
+            tried = fitted(predicted, times * config.search_px)
             if tried.share > best.share + gain:
                 best = tried
         self._share = best.share

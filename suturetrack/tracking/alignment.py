@@ -1,0 +1,52 @@
+"""Where a jump of the camera or of the whole thread has put the curve in the images."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.kernels import search
+from suturetrack.nurbs import curve_from
+from suturetrack.tracking.sampling import View, values_at, views
+from suturetrack.types import Float32, Float64, Nurbs, RidgeField
+
+_PLACES = 40
+# Reach and step, coarse and then fine.
+_GRIDS_PX = ((42.0, 3.0), (2.0, 1.0))
+# What a pixel of the shift has to show more of the thread, as a part of all of it.
+_PRICE = 0.0012
+
+
+def shifted(curve: Nurbs, field: RidgeField, rig: StereoRig, levels: tuple[float, float]) -> Nurbs:
+    """The curve, moved sidewise as a whole to where the images show most of the thread.
+
+    Args:
+        curve: as predicted, calibration's unit, rectified left camera.
+        levels: response of a clear view of the thread, left and right.
+    """
+    s = np.linspace(0, 1, _PLACES)
+    both = views(rig, values_at(curve, s), values_at(curve, s, 1))
+    best: Float64 = np.zeros(2)
+    for reach, step in _GRIDS_PX:
+        steps = np.arange(-reach, reach + step / 2, step)
+        shifts = best + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        shown = _shown(both, shifts, (field.left, field.right), levels)
+        best = shifts[np.argmax(shown - _PRICE * np.hypot(*shifts.T))]
+    depth = curve.control_points[:, 2:]
+    offset = np.hstack([best * depth / rig.focal, np.zeros_like(depth)])
+    return curve_from(curve.degree, curve.knots, curve.control_points + offset)
+
+
+def _shown(
+    both: tuple[View, View],
+    shifts: Float64,
+    images: tuple[Float32, Float32],
+    levels: tuple[float, float],
+) -> Float64:
+    """(n,) how much of the thread the images show under each of n shifts, in [0, 1]."""
+    shown = np.zeros(len(shifts))
+    for image, view, level in zip(images, both, levels, strict=True):
+        pixels = (view.pixels + shifts[:, None]).reshape(-1, 2)
+        responses = search.responses(image, pixels, np.tile(view.tangents, (len(shifts), 1)))
+        shown += np.minimum(responses / level, 1.0).reshape(len(shifts), -1).mean(axis=1) / 2
+    return shown
