@@ -48,7 +48,7 @@ def system() -> Iterator[System]:
     environment = {**os.environ, "XDG_RUNTIME_DIR": directory}
     verbs = {
         "console": ("--port", "0"),
-        "source": ("--source", f"stage:{SCENE}", "--loop", "3", "--fps", "10"),
+        "source": ("--source", f"stage:{SCENE}", "--loop", "3", "--fps", "5"),
         "segmenter": (),
         "tracker": (),
     }
