@@ -233,8 +233,9 @@ class Fleet:
     def complaint(self) -> str | None:
         """Why the run failed; None when every process ended as it should."""
         for post in self._posts:
-            if post.is_vacant:
-                return f"{post.child.complaint()}; the run ended before it was started again"
+            back = not post.starts or self._pulse.has_heard(post.child.name, post.starts)
+            if post is not self._failed and (post.is_vacant or not back):
+                return f"the {post.child.name} died, and the run ended before it was back"
         if self._failed is None:
             return None
         complaint = self._failed.child.complaint()

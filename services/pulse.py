@@ -49,6 +49,11 @@ class Pulse:
         still = 0 if moved else last.still + (not waits)
         self._beats[name] = _Beat(health, now, still)
 
+    def has_heard(self, process: str, starts: int) -> bool:
+        """Whether a process that was started again so many times has told of itself since."""
+        beat = self._beats.get(process)
+        return beat is not None and beat.health.restarts == starts
+
     def look(self, now: float | None = None) -> None:
         """Forgives everyone where the one who looks stood still itself."""
         now = time.monotonic() if now is None else now
@@ -59,9 +64,9 @@ class Pulse:
 
     def trouble(self, process: str, starts: int) -> str:
         """Why a process that was started again so many times counts as hung; empty when it does not."""
-        beat = self._beats.get(process)
-        if beat is None or beat.health.restarts != starts:
+        if not self.has_heard(process, starts):
             return ""
+        beat = self._beats[process]
         silent_s = self._looked - beat.at
         if silent_s > _SILENT_S:
             return f"nothing was heard of it for {silent_s:.0f} s"
