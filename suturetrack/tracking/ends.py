@@ -13,7 +13,12 @@ from suturetrack.types import Float64, Nurbs, RidgeField
 
 _STEP_PX = 0.5
 _INWARD_PX, _OUTWARD_PX = 40.0, 10.0
-_HALF = 0.5
+# What eq. (1) leaves of the response at the very end of a ridge.
+_AT_THE_END = 0.43
+# Before and behind a plain end the response takes so far to fall from and to these parts; it takes
+# longer behind an end at something dark, and so much is taken back at most.
+_BEFORE, _BEHIND, _SYMMETRY = 0.7, 0.15, 1.12
+_SOFTEST_PX = 2.0
 # Responses below this part of a clear view are background.
 _FAINT = 0.2
 # What is shorter than this is a speck behind the end and not its continuation.
@@ -79,14 +84,14 @@ def _smooth(profile: Float64) -> Float64:
 def _outer_boundary(x: Float64, mean: Float64, least: Float64) -> float | None:
     """Where the outermost solid run that begins on the curve ends, to a part of a pixel.
 
-    The thread may fade towards its end: the step is looked for at half of what it shows there.
+    The thread may fade towards its end: the step is looked for at a part of what it shows there.
     """
     runs = search.solid((x <= 0) & (mean > _FAINT), np.full(len(x), _STEP_PX), _SOLID_PX)
     if not runs.any():
         return None
     last = int(np.flatnonzero(runs)[-1])
     plateau = float(np.median(mean[max(last - 24, 0) : last - 6]))
-    threshold = _HALF * plateau
+    threshold = _AT_THE_END * plateau
     while last > 0 and mean[last] < threshold:
         last -= 1
     beyond = max(threshold, _FAINT)
@@ -98,7 +103,29 @@ def _outer_boundary(x: Float64, mean: Float64, least: Float64) -> float | None:
         last += 1
     if last + 1 == len(x):
         return float(x[-1])
-    share = (mean[last] - threshold) / max(float(mean[last] - mean[last + 1]), 1e-6)
+    end = _crossing(x, mean, last, threshold)
+    return end - _softness(x, mean / plateau, last, end) if mean[last + 1] < threshold else end
+
+
+def _softness(x: Float64, mean: Float64, last: int, end: float) -> float:
+    """How much further the response falls behind the end than before it, px.
+
+    A hole that the thread comes out of, or a shadow that it casts, responds as well, and draws the end
+    outward. Blur is the same on both sides.
+    """
+    before = behind = last
+    while before > 0 and mean[before] < _BEFORE:
+        before -= 1
+    while behind + 2 < len(x) and mean[behind + 1] >= _BEHIND:
+        behind += 1
+    rise = end - _crossing(x, mean, before, _BEFORE)
+    fall = _crossing(x, mean, behind, _BEHIND) - end
+    return min(max(fall - _SYMMETRY * rise, 0.0), _SOFTEST_PX)
+
+
+def _crossing(x: Float64, mean: Float64, last: int, level: float) -> float:
+    """Where the response falls to the level behind the sample `last`."""
+    share = (mean[last] - level) / max(float(mean[last] - mean[last + 1]), 1e-6)
     return float(x[last] + _STEP_PX * min(max(share, 0.0), 1.0))
 
 
