@@ -54,7 +54,7 @@ class Recorder:
         config: object = None,
         *,
         patient: bool = True,
-        flush_seconds: float = 0.5,
+        flush_seconds: float = 0.3,
         part_bytes: int = 1 << 30,
     ) -> None:
         """Opens the file and writes what does not change: cameras, versions and parameters.

@@ -28,8 +28,8 @@ RECORDING_VERSION = 1
 
 _log = logging.getLogger(__name__)
 _LONGEST_FLUSH_SECONDS = 4.0
-_LONGEST_PART_SECONDS = 300.0
-"""Rerun keeps an index of an open file in memory: 20 MB a minute of a tracked thread."""
+_LONGEST_PART_SECONDS = 240.0
+"""Rerun keeps an index of an open file in memory: some 30 MB a minute of a thread."""
 
 
 class RunFile(Writer):

@@ -421,7 +421,7 @@ WRITER = """
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (480, 640, 3), np.uint8)
     recorder = Recorder(
-        run, "source", "full", make_rig(), patient=False, flush_seconds=0.2 if limit else 0.5
+        run, "source", "full", make_rig(), patient=False, flush_seconds=0.2 if limit else 0.3
     )
     begin = time.monotonic()
     for i in range(10_000):
