@@ -13,6 +13,8 @@ from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.tracking.control_points import rearrange, refit
+from suturetrack.tracking.gauss_newton import expected
+from suturetrack.tracking.sampling import Samples
 from suturetrack.types import RidgeField, Seed, Status, ThreadState
 from tests.conftest import make_rig
 from tests.painting import FPS, paint, stamp, thread
@@ -132,6 +134,38 @@ def test_a_jump_of_the_camera_does_not_lose_the_thread(rig: StereoRig) -> None:
     states = follow(fields, rig, seed_on(rig, truths[0]))
     assert all(state.status is Status.TRACKING for state in states)
     assert error(states[10], truths[10]).largest < 1.0
+
+
+def test_a_thread_that_moves_across_itself_is_expected_to_fade(rig: StereoRig) -> None:
+    x = np.linspace(-30, 30, 200)
+    points = np.stack([x, 0 * x, 200 + 0 * x], axis=1)
+    s = np.linspace(0, 1, 200)
+    curve = nurbs.fit(points, s, nurbs.clamped_knots(np.linspace(0, 1, 6)[1:-1], 3), 3)
+    samples = Samples.of(curve.knots, 5)
+
+    def response(move: tuple[float, float]) -> tuple[float, float]:
+        moved = replace(curve, control_points=curve.control_points + np.array([*move, 0.0]))
+        left, right = expected(curve, moved, samples, rig, (0.8, 0.4))
+        return float(left.mean()), float(right.mean())
+
+    assert response((2.0, 0.0)) == pytest.approx((0.8, 0.4))
+    slow, fast, faster = (response((0.0, px / 4)) for px in (1.0, 8.0, 40.0))
+    assert slow == pytest.approx((0.8, 0.4), rel=0.01)
+    assert fast == pytest.approx((0.8 * 0.303, 0.4 * 0.303), rel=0.02)
+    assert faster[0] < fast[0]
+    assert faster[0] > 0.1
+
+
+def test_an_end_that_is_hidden_for_a_moment_makes_the_thread_no_shorter(rig: StereoRig) -> None:
+    whole = thread(0.0)
+    hidden = range(30, 36)
+    fields = [paint(rig, [whole[:520] if i in hidden else whole], i) for i in range(60)]
+    fields += [paint(rig, [], i) for i in range(60, 75)]
+    fields += [paint(rig, [whole], i) for i in range(75, 90)]
+    states = follow(fields, rig, seed_on(rig, whole))
+    assert states[74].status is Status.LOST
+    assert states[75 + round(0.3 * FPS)].status is Status.TRACKING
+    assert states[-1].length == pytest.approx(100.0, rel=0.01)
 
 
 def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:

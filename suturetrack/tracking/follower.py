@@ -91,6 +91,18 @@ class Follower:
         """Takes over what was known of the thread's length before it was found anew."""
         self.known_length, self._established = before.known_length, before._established
 
+    def came_from(self, before: Nurbs, seconds: float) -> None:
+        """Tells where the thread was found so many seconds ago."""
+        model = self.model
+        model.motion = Motion.none().learn(
+            before, model.curve, self._seen, model.ends.seen, self.rig, seconds
+        )
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether it has been uncertain for more than a moment where the thread runs."""
+        return (self.model.capture_ns - self._certain_ns) * _NS > _PATIENCE_S
+
     def strands(self, capture_ns: int) -> Neighbours:
         """What is seen of the thread, where it should be at that time: others keep clear of it."""
         model = self.model
@@ -234,11 +246,13 @@ class Follower:
 
     def _search(self, predicted: Nurbs, field: RidgeField, neighbours: Neighbours) -> Evidence:
         """Looks further away for what was seen before, and now and then for what is hidden."""
-        levels, config = self.model.levels, self.config
+        before, levels, config = self.model.curve, self.model.levels, self.config
 
         def fitted(start: Nurbs, reach_px: float) -> Evidence:
             return Evidence.of(
-                gauss_newton.fit(start, field, self.rig, levels, reach_px, config, neighbours)
+                gauss_newton.fit(
+                    before, start, field, self.rig, levels, reach_px, config, neighbours
+                )
             )
 
         best = fitted(predicted, config.search_px)

@@ -35,6 +35,9 @@ _HIDDEN_DRIFT_PX = 3.0
 # A first search does not know the thread's direction yet where it has bent.
 _LENIENCY = 0.4
 _EVEN = 150.0
+# A thread that moves so far across itself between two fields is smeared to half its response.
+_SMEARED_PX = 6.5
+_LEAST_FADING = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,7 @@ def search_normals(
     image: Float32,
     view: View,
     share: Float64,
-    level: float,
+    level: Float64,
     reach_px: float,
     size: tuple[int, int],
     neighbours: Strand,
@@ -82,7 +85,10 @@ def search_normals(
     profiles = search.normal_profiles(image, view.pixels, view.tangents, grid, leniency)
     strand = Strand.of(view, share)
     taken = search.claimed(strand.arrays, strand.joined(neighbours).arrays, grid, SAME_STRAND_PX)
-    gain = np.where(taken, 0.0, np.minimum(profiles / level, 1.0)) - 0.1 * (grid / reach_px) ** 2
+    gain = (
+        np.where(taken, 0.0, np.minimum(profiles / level[:, None], 1.0))
+        - 0.1 * (grid / reach_px) ** 2
+    )
     path = search.best_path(gain, _ROUGHNESS * _STEP_PX**2, 4)
     position, response = search.peaks(profiles, path, round(_PEAK_HALF_PX / _STEP_PX))
     offset = (position - half) * _STEP_PX
@@ -94,6 +100,7 @@ def search_normals(
 
 
 def fit(
+    before: Nurbs,
     predicted: Nurbs,
     field: RidgeField,
     rig: StereoRig,
@@ -105,6 +112,7 @@ def fit(
     """Moves the predicted curve onto the field.
 
     Args:
+        before: the curve in the last field, on the same knots.
         predicted: cubic, parametrised like its arc length.
         levels: response of a clear view of the thread, left and right.
         reach_px: how far along the normals the thread is looked for at first.
@@ -113,11 +121,12 @@ def fit(
     samples = Samples.of(predicted.knots, config.samples_per_span)
     reference = _Reference.of(samples, predicted)
     control_points = predicted.control_points
+    faded = expected(before, predicted, samples, rig, levels)
     reach, outlier = reach_px, math.inf
     rounds = config.iterations + round(math.log2(max(reach_px / config.search_px, 1.0)))
     for _ in range(rounds):
-        linear = _Linearized(samples, control_points, field, rig, levels, reach, neighbours)
-        equations = linear.equations(reference, levels, config, outlier)
+        linear = _Linearized(samples, control_points, field, rig, faded, reach, neighbours)
+        equations = linear.equations(reference, faded, config, outlier)
         control_points = control_points + equations.solve()
         outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
         reach = max(reach / 2, _REFINED_PX)
@@ -136,11 +145,33 @@ def observe(
 ) -> Fit:
     """What the field says about a curve that something else has fitted."""
     samples = Samples.of(curve.knots, config.samples_per_span)
-    linear = _Linearized(samples, curve.control_points, field, rig, levels, _REFINED_PX, neighbours)
-    equations = linear.equations(_Reference.of(samples, curve), levels, config, _OUTLIER_PX)
+    still = expected(curve, curve, samples, rig, levels)
+    linear = _Linearized(samples, curve.control_points, field, rig, still, _REFINED_PX, neighbours)
+    equations = linear.equations(_Reference.of(samples, curve), still, config, _OUTLIER_PX)
     equations.solve()
     residual = _residual([view.pixels for view in linear.views], linear)
     return Fit(curve, samples, linear.offsets, residual, equations.covariance(samples))
+
+
+def expected(
+    before: Nurbs,
+    after: Nurbs,
+    samples: Samples,
+    rig: StereoRig,
+    levels: tuple[float, float],
+) -> tuple[Float64, Float64]:
+    """(k,) the response of the thread left and right where it moves, which smears it."""
+    points, first = samples.values(after.control_points), samples.values(after.control_points, 1)
+    last = rig.project(samples.values(before.control_points))
+    left, right = (
+        level * np.maximum(1 / (1 + (_across(view, pixels) / _SMEARED_PX) ** 4), _LEAST_FADING)
+        for view, pixels, level in zip(views(rig, points, first), last, levels, strict=True)
+    )
+    return left, right
+
+
+def _across(view: View, pixels: Float64) -> Float64:
+    return np.asarray(np.sum((view.pixels - pixels) * view.normals, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +200,7 @@ class _Linearized:
         control_points: Float64,
         field: RidgeField,
         rig: StereoRig,
-        levels: tuple[float, float],
+        levels: tuple[Float64, Float64],
         reach_px: float,
         neighbours: Neighbours,
     ) -> None:
@@ -189,7 +220,7 @@ class _Linearized:
     def equations(
         self,
         reference: _Reference,
-        levels: tuple[float, float],
+        levels: tuple[Float64, Float64],
         config: TrackingConfig,
         outlier_px: float,
     ) -> _Equations:

@@ -23,9 +23,12 @@ from suturetrack.types import Energies, Nurbs, RidgeField, Seed, Stamp, Status, 
 
 FORGOTTEN = "forgotten"
 """Event of the last state of a thread that was dropped."""
-_BETWEEN_ATTEMPTS_NS = 150_000_000
+_BETWEEN_ATTEMPTS_NS = 66_000_000
 # After so many the attempts become rarer, for each takes as long as many fields.
-_QUICK_ATTEMPTS = 6
+_QUICK_ATTEMPTS = 12
+_RAREST = 3
+# A thread that was just found has no velocity yet: if it runs away it is found once more.
+_JUST_NS = 110_000_000
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
 
@@ -51,6 +54,8 @@ class _Thread:
     """Until when the lost thread is not looked for again."""
     failures: int = 0
     """How often it was looked for in vain."""
+    found: tuple[int, Nurbs] | None = None
+    """When it was last found by looking for it, and where."""
     rows: int = 0
     """How much lower than the calibration says the right view shows the thread, px."""
 
@@ -131,6 +136,10 @@ class Tracker:
     ) -> ThreadState:
         state = follower.step(field, name, self._others(name, field))
         was_lost = thread.last is not None and thread.last.status is Status.LOST
+        doubtful = follower.is_doubtful or self._just_found(thread, field)
+        if state.status is Status.OCCLUDED and doubtful:
+            again = self._look_again(name, thread, follower.last_good, follower.known_length, field)
+            return again or state
         if state.status is not Status.LOST:
             thread.wait_ns = thread.failures = 0
             return replace(state, events=("recovered", *state.events)) if was_lost else state
@@ -150,9 +159,9 @@ class Tracker:
         self, name: str, thread: _Thread, last: Nurbs, known_length: float | None, field: RidgeField
     ) -> ThreadState | None:
         """The state of a lost thread that is found again, every now and then looked for."""
-        if field.stamp.capture_ns < thread.wait_ns:
+        if field.stamp.capture_ns < thread.wait_ns and not self._just_found(thread, field):
             return None
-        patience = min(max(thread.failures - _QUICK_ATTEMPTS, 0), 2)
+        patience = min(max(thread.failures - _QUICK_ATTEMPTS, 0), _RAREST)
         thread.wait_ns = field.stamp.capture_ns + (_BETWEEN_ATTEMPTS_NS << patience)
         thread.failures += 1
         curve = find_again(last, known_length, thread.seed, field, self._rig, self._initialization)
@@ -166,7 +175,20 @@ class Tracker:
         if state.status is not Status.TRACKING:
             return None
         thread.follower = follower
+        self._take_velocity(thread, field)
         return replace(state, events=("found again", *state.events))
+
+    def _just_found(self, thread: _Thread, field: RidgeField) -> bool:
+        return thread.found is not None and field.stamp.capture_ns - thread.found[0] < _JUST_NS
+
+    def _take_velocity(self, thread: _Thread, field: RidgeField) -> None:
+        """Where the thread was found twice in a row, the step between tells its velocity."""
+        assert thread.follower is not None
+        now, curve = field.stamp.capture_ns, thread.follower.model.curve
+        if thread.found is not None and self._just_found(thread, field):
+            before_ns, before = thread.found
+            thread.follower.came_from(before, (now - before_ns) * 1e-9)
+        thread.found = now, curve
 
     def _follower(self, thread: _Thread, curve: Nurbs, field: RidgeField) -> Follower:
         return Follower(curve, field, self._rig.with_row_offset(thread.rows), self._config)
