@@ -192,6 +192,25 @@ def test_strands_that_lie_on_each_other_are_both_followed(rig: StereoRig) -> Non
     assert error.rms < 1.5
 
 
+@pytest.mark.parametrize(("scenario", "seed"), [("knot", 200), ("crossings", 211)])
+def test_strands_of_one_thread_are_told_apart(scenario: str, seed: int) -> None:
+    """A loop whose ends run into its side, and one that crosses itself closely."""
+    scene = open_scene(scenario, seed)
+    frame = StereoFrame(STAMP, *scene.render(0))
+    start = Seed(pixel=scene.seed_pixel(0))
+    segmenter = Segmenter(scene.rig)
+    segmenter.learn(frame, start)
+    found = initialize(segmenter.step(frame), scene.rig, start)
+    truth = scene.truth(0)[0].points
+    error = curve_error(dense(found.curve), truth)
+    assert abs(error.length_percent) < 2
+    assert error.rms < 0.3
+    assert max(error.ends) < 1
+    nearest = cKDTree(truth).query(dense(found.curve)[::50])[1]
+    assert abs(spearmanr(nearest, np.arange(len(nearest))).statistic) > 0.9
+    assert found.confidence > 0.5
+
+
 def test_a_highlight_is_bridged(rig: StereoRig, curve: Nurbs) -> None:
     truth = dense(curve)
     views = []

@@ -27,8 +27,12 @@ _TOUCHING_PX = 6.0
 _BRIDGE_SAMPLES = 12
 _SWING = 0.01
 """Price of a bridge that bends one way and then the other."""
-_LEAD = 0.1
-"""How much cheaper than its best rival a merge must be to be beyond doubt."""
+_REASSURANCE = 0.3
+"""Share of its lead over the next best way that the price of a merge is less doubtful by."""
+_STRAIN = 1.5
+"""How much of the confidence is lost with each unit of doubt that is left of the price."""
+_RUNS_ON = 0.55
+"""Price of a merge below which an end might as well run on."""
 _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""
 _FREE_END = 0.5
@@ -61,23 +65,38 @@ class Merged:
     def doubts(self, entries: list[int]) -> list[tuple[int, str, float]]:
         """What is doubtful about the thread that enters its segments at `entries`: at which end, why,
         and what that leaves of the confidence."""
-        best: dict[int, list[tuple[float, int]]] = {}
-        for (i, j), price in self.price.items():
-            best.setdefault(i, []).append((price, j))
+        within = _within_reach(self.price)
         found = []
         for entry in entries[1:]:
-            other = self.partner[entry]
-            price = self.price[entry, other]
-            rivals = [p for e in (entry, other) for p, j in best[e] if j not in (entry, other)]
-            lead = min(rivals, default=2.0) - price
+            price = self.price[entry, self.partner[entry]]
+            lead = min(self._lead(entry, entries, within), _FREE_END)
+            strain = price - _REASSURANCE * lead
             if price >= 2 * _FREE_END:
                 found.append((entry, "a sharp bend", 0.6))
-            elif lead < _LEAD:
-                found.append((entry, "an ambiguous crossing", 0.7 + max(lead, -0.2)))
+            elif strain > 0:
+                rest = max(1 - _STRAIN * strain, 0.1)
+                found.append((entry, "an ambiguous crossing", rest))
         for tip in (entries[0], entries[-1] ^ 1):
             if self._runs_into_another(tip):
-                found.append((tip, "an end beside another ridge", 0.25))
+                on = min((self.price[tip, j] for j in within.get(tip, ())), default=np.inf)
+                rest = 0.25 if on < _RUNS_ON else 0.4
+                found.append((tip, "an end beside another ridge", rest))
         return found
+
+    def _lead(self, entry: int, entries: list[int], within: dict[int, list[int]]) -> float:
+        """How much more the ends cost in total if another way is taken at `entry`."""
+        other = self.partner[entry]
+        on_thread = {e // 2 for e in entries}
+        added = [
+            _swap(end, rival, self.partner, self.price, within)[0]
+            for end, partner in ((entry, other), (other, entry))
+            for rival in within.get(end, ())
+            if rival != partner and not (self._is_copy(rival, partner) and rival // 2 in on_thread)
+        ]
+        return max(min(added, default=1.0), 0.0)
+
+    def _is_copy(self, one: int, other: int) -> bool:
+        return one % 2 == other % 2 and self.segments[one // 2] is self.segments[other // 2]
 
     def _runs_into_another(self, tip: int) -> bool:
         segment = self.segments[tip // 2]
@@ -243,38 +262,54 @@ def _pair(partner: dict[int, int], pairs: Int64) -> None:
 
 def _exchange(partner: dict[int, int], price: dict[tuple[int, int], float]) -> None:
     """Swaps partners as long as that lowers the total."""
-    within: dict[int, list[int]] = {}
-    for (i, j), cost in price.items():
-        if cost < 2 * _FREE_END:
-            within.setdefault(i, []).append(j)
-
-    def paid(i: int) -> float:
-        return price[i, partner[i]] if i in partner else _FREE_END
-
-    def instead(left: list[int], taken: set[int]) -> tuple[float, list[tuple[int, int]]]:
-        """The cheapest pairs for ends that lose their partners, and what that costs."""
-        ways: list[tuple[float, list[tuple[int, int]]]] = [(_FREE_END * len(left), [])]
-        if len(left) == 2 and left[1] in within.get(left[0], ()):
-            ways.append((price[left[0], left[1]], [(left[0], left[1])]))
-        if len(left) == 1:
-            free = [k for k in within.get(left[0], ()) if k not in partner and k not in taken]
-            ways += [(price[left[0], k] - _FREE_END, [(left[0], k)]) for k in free]
-        return min(ways)
-
+    within = _within_reach(price)
     improved = True
     while improved:
         improved = False
         for i, j in list(price):
             if partner.get(i) == j or price[i, j] >= 2 * _FREE_END:
                 continue
-            left = [partner[end] for end in (i, j) if end in partner]
-            cost, pairs = instead(left, {i, j})
-            if price[i, j] + cost < paid(i) + paid(j) - 1e-9:
+            added, left, pairs = _swap(i, j, partner, price, within)
+            if added < -1e-9:
                 for end in left:
                     del partner[end]
-                for one, other in ((i, j), *pairs):
+                for one, other in pairs:
                     partner[one], partner[other] = other, one
                 improved = True
+
+
+def _within_reach(price: dict[tuple[int, int], float]) -> dict[int, list[int]]:
+    within: dict[int, list[int]] = {}
+    for (i, j), cost in price.items():
+        if cost < 2 * _FREE_END:
+            within.setdefault(i, []).append(j)
+    return within
+
+
+def _swap(
+    i: int,
+    j: int,
+    partner: dict[int, int],
+    price: dict[tuple[int, int], float],
+    within: dict[int, list[int]],
+) -> tuple[float, list[int], list[tuple[int, int]]]:
+    """What joining the ends i and j would add to the total, the ends that lose their partners, and
+    the cheapest pairs for all of them."""
+
+    def paid(end: int) -> float:
+        if end not in partner:
+            return _FREE_END
+        return min(price[end, partner[end]], 2 * _FREE_END)
+
+    left = [partner[end] for end in (i, j) if end in partner]
+    ways: list[tuple[float, list[tuple[int, int]]]] = [(_FREE_END * len(left), [])]
+    if len(left) == 2 and left[1] in within.get(left[0], ()):
+        ways.append((price[left[0], left[1]], [(left[0], left[1])]))
+    if len(left) == 1:
+        free = [k for k in within.get(left[0], ()) if k not in partner and k not in (i, j)]
+        ways += [(price[left[0], k] - _FREE_END, [(left[0], k)]) for k in free]
+    cost, pairs = min(ways)
+    return price[i, j] + cost - paid(i) - paid(j), left, [(i, j), *pairs]
 
 
 def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
