@@ -95,7 +95,7 @@ class Status(StrEnum):
     TRACKING = "tracking"
     """The curve is held and most of it is seen."""
     OCCLUDED = "occluded"
-    """Less than half of it is seen, or a part may be elsewhere; the rest is the model's."""
+    """Less than half of it is seen, a part may be elsewhere, or no look at it was sure as yet."""
     LOST = "lost"
     """The thread is not where the curve says, or nobody can tell."""
 

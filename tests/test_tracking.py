@@ -11,6 +11,7 @@ import pytest
 
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
+from suturetrack.initialization import Initialization, initialize
 from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.tracking.control_points import rearrange, refit
 from suturetrack.tracking.gauss_newton import expected
@@ -294,6 +295,28 @@ def test_dropped_fields_and_a_jump_in_time_are_survived(rig: StereoRig) -> None:
     states = follow(fields, rig, seed_on(rig, thread(0.0)))
     assert all(state.status is Status.TRACKING for state in states)
     assert error(states[-1], thread(15 / FPS)).rms < 0.1
+
+
+def test_a_doubtful_start_is_not_called_tracking_until_a_look_is_sure(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks = []
+
+    def doubtful_at_first(*args: object) -> Initialization:
+        found = initialize(*args)  # type: ignore[arg-type]
+        looks.append(found)
+        return replace(found, confidence=0.4 if len(looks) < 3 else 0.9)
+
+    monkeypatch.setattr("suturetrack.tracking.tracker.initialize", doubtful_at_first)
+    truths = [thread(i / FPS) for i in range(60)]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    sure = next(i for i, state in enumerate(states) if "found for sure" in state.events)
+    assert len(looks) == 3
+    assert all(state.status is Status.OCCLUDED for state in states[:sure])
+    assert all(state.status is Status.TRACKING for state in states[sure:])
+    assert error(states[-1], truths[-1]).rms < 0.1
+    assert error(states[sure - 1], truths[sure - 1]).rms < 0.1
 
 
 def test_the_thread_is_looked_for_until_patience_ends(rig: StereoRig) -> None:

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import InitializationConfig, InitializationError, initialize
+from suturetrack.initialization import (
+    Initialization,
+    InitializationConfig,
+    InitializationError,
+    initialize,
+)
 from suturetrack.kernels import search
 from suturetrack.nurbs import evaluate, length, reversed_curve, tangents
 from suturetrack.tracking.sampling import views
@@ -26,18 +33,18 @@ def find_again(
     field: RidgeField,
     rig: StereoRig,
     config: InitializationConfig,
-) -> Nurbs | None:
+) -> Initialization | None:
     """The thread in the field, run in the direction of the last curve; None where it is not found.
 
     A curve counts as the thread if its length is the known one, or none is known.
     """
     for start in (*_seeds_on(last, seed.thread, field, rig), seed):
         try:
-            curve = initialize(field, rig, start, config).curve
+            found = initialize(field, rig, start, config)
         except InitializationError:
             continue
-        if known_length is None or abs(length(curve) / known_length - 1) < _LENGTH_TOLERANCE:
-            return directed(curve, last)
+        if known_length is None or abs(length(found.curve) / known_length - 1) < _LENGTH_TOLERANCE:
+            return replace(found, curve=directed(found.curve, last))
     return None
 
 

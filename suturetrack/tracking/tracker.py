@@ -13,13 +13,14 @@ from suturetrack.initialization import (
     InitializationError,
     initialize,
 )
+from suturetrack.nurbs import evaluate
 from suturetrack.tracking.clock import StreamClock
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.recovery import directed, find_again, lies_on
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.tracking.strands import NOBODY, Neighbours
-from suturetrack.types import Energies, Nurbs, RidgeField, Seed, Stamp, Status, ThreadState
+from suturetrack.types import Energies, Float64, Nurbs, RidgeField, Seed, Stamp, Status, ThreadState
 
 FORGOTTEN = "forgotten"
 """Event of the last state of a thread that was dropped."""
@@ -29,6 +30,9 @@ _QUICK_ATTEMPTS = 12
 _RAREST = 3
 # A thread that was just found has no velocity yet: if it runs away it is found once more.
 _JUST_NS = 110_000_000
+# A first curve of less confidence is followed, but not called the thread until a later look is surer.
+_SURE = 0.5
+_BETWEEN_LOOKS_NS = 250_000_000
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
 
@@ -56,6 +60,10 @@ class _Thread:
     """How often it was looked for in vain."""
     found: tuple[int, Nurbs] | None = None
     """When it was last found by looking for it, and where."""
+    is_sure: bool = True
+    """Whether the curve that is followed may be called the thread."""
+    seeded_at: float = 0.5
+    """Parameter of the curve at the seed."""
     rows: int = 0
     """How much lower than the calibration says the right view shows the thread, px."""
 
@@ -127,6 +135,8 @@ class Tracker:
                 state = self._regain(name, thread, thread.last.curve, thread.last, dated)
             else:
                 state = self._find(name, thread, dated, initializations)
+            if state.status is Status.TRACKING and not thread.is_sure:
+                state = replace(state, status=Status.OCCLUDED)
             thread.last = replace(state, stamp=field.stamp)
             states.append(thread.last)
         return TrackerStep(tuple(states), initializations)
@@ -134,11 +144,16 @@ class Tracker:
     def _follow(
         self, name: str, thread: _Thread, follower: Follower, field: RidgeField
     ) -> ThreadState:
+        if not thread.is_sure and self._look_closer(name, thread, follower, field):
+            assert thread.follower is not None
+            state = thread.follower.step(field, name, self._others(name, field))
+            return replace(state, events=("found for sure", *state.events))
         state = follower.step(field, name, self._others(name, field))
         was_lost = thread.last is not None and thread.last.status is Status.LOST
         doubtful = follower.is_doubtful or self._just_found(thread, field)
         if state.status is Status.OCCLUDED and doubtful:
-            again = self._look_again(name, thread, follower.last_good, follower.known_length, field)
+            last, length = follower.last_good, follower.known_length
+            again = self._look_again(name, thread, last, length, field, is_held=True)
             return again or state
         if state.status is not Status.LOST:
             thread.wait_ns = thread.failures = 0
@@ -148,6 +163,26 @@ class Tracker:
         again = self._look_again(name, thread, follower.last_good, follower.known_length, field)
         return again or state
 
+    def _look_closer(
+        self, name: str, thread: _Thread, follower: Follower, field: RidgeField
+    ) -> bool:
+        """Whether a new look from where the seed was is sure; what it finds is followed then."""
+        if field.stamp.capture_ns < thread.wait_ns:
+            return False
+        thread.wait_ns = field.stamp.capture_ns + (_BETWEEN_LOOKS_NS << min(thread.failures, 4))
+        thread.failures += 1
+        curve = follower.model.curve
+        x, y, z = (float(c) for c in evaluate(curve, np.array([thread.seeded_at]))[0])
+        try:
+            found = initialize(field, self._rig, Seed(name, point=(x, y, z)), self._initialization)
+        except InitializationError:
+            return False
+        thread.is_sure = found.confidence >= _SURE
+        if thread.is_sure:
+            thread.wait_ns = thread.failures = 0
+            thread.follower = self._follower(thread, directed(found.curve, curve), field)
+        return thread.is_sure
+
     def _regain(
         self, name: str, thread: _Thread, curve: Nurbs, last: ThreadState, field: RidgeField
     ) -> ThreadState:
@@ -156,25 +191,38 @@ class Tracker:
         return again or replace(last, stamp=field.stamp)
 
     def _look_again(
-        self, name: str, thread: _Thread, last: Nurbs, known_length: float | None, field: RidgeField
+        self,
+        name: str,
+        thread: _Thread,
+        last: Nurbs,
+        known_length: float | None,
+        field: RidgeField,
+        *,
+        is_held: bool = False,
     ) -> ThreadState | None:
-        """The state of a lost thread that is found again, every now and then looked for."""
+        """The state of a thread that is found again, every now and then looked for.
+
+        One that is held still gives way only to a curve that is sure.
+        """
         if field.stamp.capture_ns < thread.wait_ns and not self._just_found(thread, field):
             return None
         patience = min(max(thread.failures - _QUICK_ATTEMPTS, 0), _RAREST)
         thread.wait_ns = field.stamp.capture_ns + (_BETWEEN_ATTEMPTS_NS << patience)
         thread.failures += 1
-        curve = find_again(last, known_length, thread.seed, field, self._rig, self._initialization)
+        found = find_again(last, known_length, thread.seed, field, self._rig, self._initialization)
         others = self._others(name, field)
-        if curve is None or lies_on(curve, others, self._rig):
+        if found is None or lies_on(found.curve, others, self._rig):
             return None
-        follower = self._follower(thread, curve, field)
+        is_sure = found.confidence >= _SURE
+        if is_held and not is_sure:
+            return None
+        follower = self._follower(thread, found.curve, field)
         if thread.follower is not None:
             follower.remember(thread.follower)
         state = follower.step(field, name, others)
         if state.status is not Status.TRACKING:
             return None
-        thread.follower = follower
+        thread.follower, thread.is_sure = follower, is_sure
         self._take_velocity(thread, field)
         return replace(state, events=("found again", *state.events))
 
@@ -223,9 +271,21 @@ class Tracker:
             found = replace(found, curve=directed(found.curve, thread.toward))
         initializations[name] = found
         thread.rows = found.row_offset_px
+        thread.is_sure = found.confidence >= _SURE
+        thread.seeded_at = _nearest(found.curve, thread.seed, self._rig)
+        thread.wait_ns = field.stamp.capture_ns + _BETWEEN_LOOKS_NS
         thread.follower = self._follower(thread, found.curve, field)
         state = thread.follower.step(field, name, self._others(name, field))
         return replace(state, events=("found", *state.events))
+
+
+def _nearest(curve: Nurbs, seed: Seed, rig: StereoRig) -> float:
+    """Parameter of the curve's point that is nearest to the seed."""
+    s: Float64 = np.linspace(0, 1, 400)
+    points = evaluate(curve, s)
+    places = points if seed.pixel is None else rig.project_raw(points)[0]
+    wanted = np.array(seed.point if seed.pixel is None else seed.pixel)
+    return float(s[np.argmin(np.linalg.norm(places - wanted, axis=1))])
 
 
 def _not_found(name: str, stamp: Stamp, events: tuple[str, ...]) -> ThreadState:
