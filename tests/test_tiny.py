@@ -216,9 +216,11 @@ def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
 
 
 def test_a_seed_on_nothing_leaves_no_trace_once_it_is_refused() -> None:
-    """One picture again and again: a pixel of the ground teaches a look in which nothing is seen."""
+    """One picture again and again: a line that only the left view shows teaches its look."""
     scene, rig = open_scene("figure8-107"), Rig()
-    images, camera = scene.render(0), rig.connect("source")
+    left, right = scene.render(0)
+    images, camera = (left.copy(), right), rig.connect("source")
+    images[0][58:62, 100:180] = 40, 200, 60
     camera.answer(topics.CALIBRATION, lambda _: scene.rig)
     steps, drops = camera.every(topics.STEP), camera.every(topics.DROPPED)
     fields = camera.every(topics.FIELD)
@@ -230,7 +232,7 @@ def test_a_seed_on_nothing_leaves_no_trace_once_it_is_refused() -> None:
     for frame in range(34):
         if frame == 1:
             with suppress(NoAnswer):
-                camera.ask(topics.SEED, Seed("wrong", pixel=(141.0, 69.0)), timeout=0)
+                camera.ask(topics.SEED, Seed("wrong", pixel=(141.0, 60.0)), timeout=0)
         camera.publish(topics.FRAME, StereoFrame(Stamp(frame, frame, 0), *images))
         assert steps.get(60) is not None
         seen.append(next(iter(fields)).left.tobytes())
