@@ -43,9 +43,14 @@ def find_again(
             found = initialize(field, rig, start, config)
         except InitializationError:
             continue
-        if known_length is None or abs(length(found.curve) / known_length - 1) < _LENGTH_TOLERANCE:
+        if has_length(found.curve, known_length):
             return replace(found, curve=directed(found.curve, last))
     return None
+
+
+def has_length(curve: Nurbs, known_length: float | None) -> bool:
+    """Whether the curve is as long as the thread is known to be; any is where nothing is known."""
+    return known_length is None or abs(length(curve) / known_length - 1) < _LENGTH_TOLERANCE
 
 
 def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:

@@ -17,7 +17,7 @@ from suturetrack.nurbs import evaluate
 from suturetrack.tracking.clock import StreamClock
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
-from suturetrack.tracking.recovery import directed, find_again, lies_on
+from suturetrack.tracking.recovery import directed, find_again, has_length, lies_on
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.tracking.strands import NOBODY, Neighbours
 from suturetrack.types import Energies, Float64, Nurbs, RidgeField, Seed, Stamp, Status, ThreadState
@@ -60,8 +60,10 @@ class _Thread:
     """How often it was looked for in vain."""
     found: tuple[int, Nurbs] | None = None
     """When it was last found by looking for it, and where."""
-    is_sure: bool = True
+    is_sure: bool = False
     """Whether the curve that is followed may be called the thread."""
+    was_sure: bool = False
+    """Whether it ever was, so that the thread's length is known."""
     seeded_at: float = 0.5
     """Parameter of the curve at the seed."""
     rows: int = 0
@@ -103,7 +105,7 @@ class Tracker:
         some attempts in vain whatever its length is, for the last state may have been a bad one.
         """
         last = replace(last, status=Status.LOST, events=())
-        self._threads[seed.thread] = _Thread(seed, 0, None, last)
+        self._threads[seed.thread] = _Thread(seed, 0, None, last, was_sure=True)
 
     def forget(self, thread: str) -> bool:
         """Drops the thread; the next step tells so in a last state without a curve.
@@ -135,6 +137,7 @@ class Tracker:
                 state = self._regain(name, thread, thread.last.curve, thread.last, dated)
             else:
                 state = self._find(name, thread, dated, initializations)
+            thread.was_sure |= thread.is_sure
             if state.status is Status.TRACKING and not thread.is_sure:
                 state = replace(state, status=Status.OCCLUDED)
             thread.last = replace(state, stamp=field.stamp)
@@ -177,10 +180,13 @@ class Tracker:
             found = initialize(field, self._rig, Seed(name, point=(x, y, z)), self._initialization)
         except InitializationError:
             return False
-        thread.is_sure = found.confidence >= _SURE
+        known_length = follower.known_length if thread.was_sure else None
+        thread.is_sure = found.confidence >= _SURE and has_length(found.curve, known_length)
         if thread.is_sure:
             thread.wait_ns = thread.failures = 0
             thread.follower = self._follower(thread, directed(found.curve, curve), field)
+            if thread.was_sure:
+                thread.follower.remember(follower)
         return thread.is_sure
 
     def _regain(
