@@ -153,7 +153,7 @@ class Service:
         trace: TracebackType | None,
     ) -> None:
         self.bus.stop.set()
-        if self._heartbeat.is_alive():
+        if self._heartbeat.ident is not None:  # was started, and may have ended by itself
             self._heartbeat.join()
             last = self.health()
             self.bus.publish(topics.HEALTH, last)

@@ -161,7 +161,7 @@ def test_a_folder_without_pairs_is_refused(tmp_path: Path) -> None:
 
 
 def test_first_curves_are_judged_by_their_order_however_they_are_filmed() -> None:
-    picture = Picture(size=(480, 360), distortion=-0.2, jpeg=90)
+    picture = Picture(size=(480, 360), distortion=-0.2)
     config = InitializationBench(("figure8-107",), seeds=1, picture=picture)
     (row,) = initialization_rows(config)
     assert row.solved

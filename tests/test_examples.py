@@ -86,7 +86,7 @@ def test_the_examples_and_the_verbs_work_on_a_running_system(
     next(lines(verb, r"frame \d+  position .* mm  quaternion xyzw .* sigma .* age \d+ ms"))
     for process in (watch, follow, verb):
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=20)
+        process.communicate(timeout=60)
 
     again = start("-m", "services.cli", "seed", u, v, "--thread", "needle")
     out, err = again.communicate(timeout=60)
