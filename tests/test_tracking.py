@@ -319,6 +319,30 @@ def test_a_doubtful_start_is_not_called_tracking_until_a_look_is_sure(
     assert error(states[sure - 1], truths[sure - 1]).rms < 0.1
 
 
+def test_a_sure_look_at_another_thread_does_not_count(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = thread(0) - [0, 8, 0], thread(1, 80.0, 210.0, -0.6) + np.array([0, 14, 0])
+    looks = []
+
+    def strays(field: RidgeField, rig: StereoRig, seed: Seed, config: object) -> Initialization:
+        looks.append(seed.thread)
+        if looks.count("a") > 1:
+            seed = seed_on(rig, pair[1])
+        found = initialize(field, rig, seed)
+        return replace(found, confidence=0.4 if len(looks) == 1 else 0.9)
+
+    monkeypatch.setattr("suturetrack.tracking.tracker.initialize", strays)
+    tracker = Tracker(rig)
+    for name, points in zip("ab", pair, strict=True):
+        tracker.seed(seed_on(rig, points, name))
+    steps = [tracker.step(paint(rig, pair, i)) for i in range(30)]
+    assert looks.count("a") > 2
+    for step in steps:
+        assert [state.status for state in step.states] == [Status.OCCLUDED, Status.TRACKING]
+        assert error(step.states[0], pair[0]).rms < 0.15
+
+
 def test_the_thread_is_looked_for_until_patience_ends(rig: StereoRig) -> None:
     truth = thread(0.0)
     fields = [paint(rig, [] if i < 5 else [truth], i) for i in range(8)]

@@ -181,7 +181,11 @@ class Tracker:
         except InitializationError:
             return False
         known_length = follower.known_length if thread.was_sure else None
-        thread.is_sure = found.confidence >= _SURE and has_length(found.curve, known_length)
+        thread.is_sure = (
+            found.confidence >= _SURE
+            and has_length(found.curve, known_length)
+            and not lies_on(found.curve, self._others(name, field), self._rig)
+        )
         if thread.is_sure:
             thread.wait_ns = thread.failures = 0
             thread.follower = self._follower(thread, directed(found.curve, curve), field)
