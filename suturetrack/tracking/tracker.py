@@ -24,9 +24,10 @@ from suturetrack.types import Energies, Float64, Nurbs, RidgeField, Seed, Stamp,
 
 FORGOTTEN = "forgotten"
 """Event of the last state of a thread that was dropped."""
-_BETWEEN_ATTEMPTS_NS = 66_000_000
-# After so many the attempts become rarer, for each takes as long as many fields.
-_QUICK_ATTEMPTS = 12
+# An attempt to find a thread again takes as long as many fields: so many are followed in between,
+# and more of them after so many attempts.
+_REST = 4
+_QUICK_ATTEMPTS = 6
 _RAREST = 3
 # A thread that was just found has no velocity yet: if it runs away it is found once more.
 _JUST_NS = 110_000_000
@@ -54,14 +55,18 @@ class _Thread:
     last: ThreadState | None = None
     toward: Nurbs | None = None
     """Curve of the thread that had the name before."""
-    wait_ns: int = 0
-    """Until when the lost thread is not looked for again."""
+    rest: int = 0
+    """Fields in which the lost thread is not looked for again."""
     failures: int = 0
     """How often it was looked for in vain."""
     found: tuple[int, Nurbs] | None = None
     """When it was last found by looking for it, and where."""
     is_sure: bool = False
     """Whether the curve that is followed may be called the thread."""
+    next_look_ns: int = 0
+    """When a doubtful thread is looked at again."""
+    looks: int = 0
+    """How often it was."""
     was_sure: bool = False
     """Whether it ever was, so that the thread's length is known."""
     seeded_at: float = 0.5
@@ -159,7 +164,7 @@ class Tracker:
             again = self._look_again(name, thread, last, length, field, is_held=True)
             return again or state
         if state.status is not Status.LOST:
-            thread.wait_ns = thread.failures = 0
+            thread.rest = thread.failures = 0
             return replace(state, events=("recovered", *state.events)) if was_lost else state
         if not was_lost:
             state = replace(state, events=("lost", *state.events))
@@ -170,10 +175,10 @@ class Tracker:
         self, name: str, thread: _Thread, follower: Follower, field: RidgeField
     ) -> bool:
         """Whether a new look from where the seed was is sure; what it finds is followed then."""
-        if field.stamp.capture_ns < thread.wait_ns:
+        if field.stamp.capture_ns < thread.next_look_ns:
             return False
-        thread.wait_ns = field.stamp.capture_ns + (_BETWEEN_LOOKS_NS << min(thread.failures, 4))
-        thread.failures += 1
+        thread.next_look_ns = field.stamp.capture_ns + (_BETWEEN_LOOKS_NS << min(thread.looks, 4))
+        thread.looks += 1
         curve = follower.model.curve
         x, y, z = (float(c) for c in evaluate(curve, np.array([thread.seeded_at]))[0])
         try:
@@ -187,7 +192,7 @@ class Tracker:
             and not lies_on(found.curve, self._others(name, field), self._rig)
         )
         if thread.is_sure:
-            thread.wait_ns = thread.failures = 0
+            thread.rest = thread.failures = thread.looks = 0
             thread.follower = self._follower(thread, directed(found.curve, curve), field)
             if thread.was_sure:
                 thread.follower.remember(follower)
@@ -214,10 +219,10 @@ class Tracker:
 
         One that is held still gives way only to a curve that is sure.
         """
-        if field.stamp.capture_ns < thread.wait_ns and not self._just_found(thread, field):
+        if thread.rest > 0 and not self._just_found(thread, field):
+            thread.rest -= 1
             return None
-        patience = min(max(thread.failures - _QUICK_ATTEMPTS, 0), _RAREST)
-        thread.wait_ns = field.stamp.capture_ns + (_BETWEEN_ATTEMPTS_NS << patience)
+        thread.rest = _REST << min(max(thread.failures - _QUICK_ATTEMPTS, 0), _RAREST)
         thread.failures += 1
         found = find_again(last, known_length, thread.seed, field, self._rig, self._initialization)
         others = self._others(name, field)
@@ -232,7 +237,7 @@ class Tracker:
         state = follower.step(field, name, others)
         if state.status is not Status.TRACKING:
             return None
-        thread.follower, thread.is_sure = follower, is_sure
+        thread.follower, thread.is_sure, thread.looks = follower, is_sure, 0
         self._take_velocity(thread, field)
         return replace(state, events=("found again", *state.events))
 
@@ -283,7 +288,7 @@ class Tracker:
         thread.rows = found.row_offset_px
         thread.is_sure = found.confidence >= _SURE
         thread.seeded_at = _nearest(found.curve, thread.seed, self._rig)
-        thread.wait_ns = field.stamp.capture_ns + _BETWEEN_LOOKS_NS
+        thread.next_look_ns = field.stamp.capture_ns + _BETWEEN_LOOKS_NS
         thread.follower = self._follower(thread, found.curve, field)
         state = thread.follower.step(field, name, self._others(name, field))
         return replace(state, events=("found", *state.events))
