@@ -13,9 +13,8 @@ from suturetrack.initialization.topology import follow, merge_ends
 from suturetrack.kernels import growth as kernel
 from suturetrack.types import Bool, Float32, Float64
 
-_FAINT = 0.55
-"""Strength, against the rest of the thread, below which a last segment is no part of it; measured on
-rendered threads, whose own last segments have 0.6 and more."""
+_FAINT = 0.4
+"""Strength, against the rest of the thread, below which a last segment is no part of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +94,13 @@ def grow_thread(thread: Thread, seed: Float64, config: InitializationConfig) -> 
 
 def _without_faint_ends(ridges: Ridges, entries: list[int], origin: int) -> list[int]:
     """Leaves out segments at either end that are far fainter than the thread: shadows, veins."""
-    strength = {e: ridges.sample(ridges.segments[e // 2]) for e in entries}
+    strength = {e: ridges.sample(ridges.segments[e // 2]).mean() for e in entries}
     for _ in (0, 1):
         while entries[-1] // 2 != origin:
             rest = entries[:-1]
-            level = np.median(np.concatenate([strength[e] for e in rest]))
-            if np.median(strength[entries[-1]]) > _FAINT * level:
+            sizes = [len(ridges.segments[e // 2]) for e in rest]
+            level = np.average([strength[e] for e in rest], weights=sizes)
+            if strength[entries[-1]] > _FAINT * level:
                 break
             entries = rest
         entries = entries[::-1]
