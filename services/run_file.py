@@ -28,7 +28,7 @@ RECORDING_VERSION = 1
 
 _log = logging.getLogger(__name__)
 _LONGEST_FLUSH_SECONDS = 4.0
-_LONGEST_PART_SECONDS = 240.0
+LONGEST_PART_S = 240.0
 """Rerun keeps an index of an open file in memory: some 30 MB a minute of a thread."""
 
 
@@ -105,7 +105,7 @@ class RunFile(Writer):
             self.columns.send()
             stream.flush(timeout_sec=_LONGEST_FLUSH_SECONDS)
             full = self._path.stat().st_size >= self._part_bytes
-            if full or time.monotonic() - self._opened > _LONGEST_PART_SECONDS:
+            if full or time.monotonic() - self._opened > LONGEST_PART_S:
                 self._open_part(stream)
         except FileNotFoundError:
             return "the file or its folder was removed"
