@@ -222,6 +222,30 @@ def test_a_highlight_is_bridged(rig: StereoRig, curve: Nurbs) -> None:
     assert abs(curve_error(dense(found.curve), truth).length_percent) < 2
 
 
+def shining(pixels: Float64, rig: StereoRig, stretch: slice, width: int) -> Image:
+    """A thread that is wider along a stretch, and there all highlight but for its rims."""
+    image = draw(pixels[stretch], rig, draw(pixels, rig), width=width)
+    core = slice(stretch.start + 5, stretch.stop - 5)
+    share = (190.0 - draw(pixels[core], rig, width=3)) / 120
+    return np.rint(image + share * (175.0 - image)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("stretch", "width", "is_found"), [(slice(400, 500), 6, True), (slice(500, 620), 7, False)]
+)
+def test_a_highlight_between_rims_is_no_crossing(
+    rig: StereoRig, curve: Nurbs, stretch: slice, width: int, is_found: bool
+) -> None:
+    """It is relied on where the whole thread is found, and not where it ends at the highlight."""
+    truth = dense(curve)
+    left, right = (shining(p, rig, stretch, width) for p in rig.project(truth))
+    found = initialize(
+        field_of(left, right, rig), rig, Seed(pixel=tuple(rig.project(truth[900])[0]))
+    )
+    assert (abs(curve_error(dense(found.curve), truth).length_percent) < 2) == is_found
+    assert (found.confidence > 0.7) == is_found
+
+
 def test_straight_stretches_take_few_control_points(rig: StereoRig) -> None:
     line = np.linspace([-30.0, -25, 190], [40.0, 30, 205], 1500)
     left, right = rig.project(line)

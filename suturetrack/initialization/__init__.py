@@ -146,7 +146,7 @@ def _reconstruct(
         raise InitializationError(
             f"no curve fits both views: {error}", candidates, growth
         ) from None
-    confidence, reasons = judge(curve, samples, sigma, found.chains, rig, scale)
+    confidence, reasons = judge(curve, samples, sigma, found.chains, ridges, rig, scale)
     return Initialization(curve, confidence, reasons, samples.distance_px, growth)
 
 

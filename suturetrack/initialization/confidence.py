@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.fitting import Samples
 from suturetrack.initialization.growth import Chain
-from suturetrack.metrics import coverage
+from suturetrack.initialization.segments import Ridges
+from suturetrack.metrics import coverage, polyline_length
 from suturetrack.types import Float64, Nurbs
+
+Int64 = NDArray[np.int64]
 
 _AGREED = 0.95
 """Share of the thread from which both views are said to agree."""
@@ -20,6 +25,19 @@ _VAGUE = 0.0125
 """Standard deviation of the best quarter of a curve, against its length, that halves the confidence:
 single stretches along the epipolar lines are held by the rest, a whole thread along them is not."""
 _SAME_PLACE_PX = 25.0
+_ONE_PASS = 3.0
+"""Length of a curve near a place, against the radius, from which it passes there more than once."""
+_BESIDE_PX = 5.0
+"""Distance from a curve up to which a ridge is the rim of the thread or its highlight."""
+_FAINT = 0.4
+"""Strength of a ridge, against the thread's, below which it is not another thread's."""
+_SHARP = 0.5
+"""What is left of the confidence at a sharp bend, at least, where no other ridge is near."""
+_SHARP_COSINE = 0.5
+_BEND_REACH = 8
+"""Pixels on both sides of a place between which the curve bends there."""
+_FEW = 6
+"""Points of another ridge that say nothing."""
 
 
 def judge(
@@ -27,6 +45,7 @@ def judge(
     samples: Samples,
     sigma: Float64,
     chains: tuple[Chain, Chain],
+    ridges: tuple[Ridges, Ridges],
     rig: StereoRig,
     scale: int,
 ) -> tuple[float, tuple[str, ...]]:
@@ -37,11 +56,12 @@ def judge(
         samples: what the images say beside it.
         sigma: (k,) standard deviations of the samples.
         chains: the thread as each view by itself has it; their agreement is what counts most.
+        ridges: of both views.
         rig: the cameras.
         scale: what makes the pixels of all these those of the whole image.
     """
     reasons = []
-    pixels = rig.project(nurbs.evaluate(curve, np.linspace(0, 1, 8 * len(curve.control_points))))
+    pixels = rig.project(nurbs.evaluate(curve, np.linspace(0, 1, 32 * len(curve.control_points))))
     agreement = min(_agreement(p, c.pixels, rig) for p, c in zip(pixels, chains, strict=True))
     if agreement < _AGREED:
         reasons.append(f"left and right view agree about {agreement:.0%} of the thread only")
@@ -54,15 +74,20 @@ def judge(
         reasons.append(f"uncertain depth: even its best parts to {vague:.1%} of the length only")
     confidence /= 1 + (vague / _VAGUE) ** 6
     lowest = 1.0
-    for name, chain in zip(("left", "right"), chains, strict=True):
-        doubts = _distinct(chain)
-        lowest = min(lowest, clarity(chain))
+    for view, name in enumerate(("left", "right")):
+        doubts = _settled(_distinct(chains[view]), pixels[view], ridges[view])
         reasons += [
             f"{why} in the {name} view at ({scale * u:.0f}, {scale * v:.0f})"
             for (u, v), why, _ in doubts
         ]
-    # Two views that come to the same by themselves are not both mistaken easily.
-    confidence *= np.sqrt(lowest) if agreement >= _AGREED else lowest
+        # Two views that come to the same by themselves are not both mistaken easily.
+        other = chains[1 - view].pixels
+        rests = [
+            np.sqrt(rest) if _is_shared(place, pixels[view], pixels[1 - view], other) else rest
+            for place, _, rest in doubts
+        ]
+        lowest = min(lowest, float(np.prod(rests)))
+    confidence *= lowest
     for end in (0, 1):
         readings = [samples.ends[view][end] for view in (0, 1)]
         if any(r.at_border for r in readings):
@@ -76,17 +101,61 @@ def judge(
 _ORDINAL = ("first", "last")
 
 
-def clarity(chain: Chain, places: Float64 | None = None) -> float:
-    """What the doubts about a chain, or those near (k, 2) places, leave of the confidence in it."""
-    return float(
-        np.prod(
-            [
-                rest
-                for where, _, rest in _distinct(chain)
-                if places is None or _is_near(where, places)
-            ]
-        )
-    )
+def clarity(chain: Chain, places: Float64) -> float:
+    """What the doubts about a chain near (k, 2) places leave of the confidence in it."""
+    return float(np.prod([rest for where, _, rest in _distinct(chain) if _is_near(where, places)]))
+
+
+def _settled(
+    doubts: list[tuple[Float64, str, float]], line: Float64, ridges: Ridges
+) -> list[tuple[Float64, str, float]]:
+    """The doubts that are left once the whole curve is known.
+
+    Where a single pass of the curve, (k, 2) pixels, is all the ridge near a place, there is no other
+    way that the thread might take: at most it is another thread that goes on behind a sharp bend.
+    """
+    kept = []
+    for place, why, rest in doubts:
+        near = np.flatnonzero(np.linalg.norm(line - place, axis=1) <= _SAME_PLACE_PX)
+        if not _is_one_pass(line, near) or not _is_all_ridge(place, line, near, ridges):
+            kept.append((place, why, rest))
+        elif _bends_sharply(line[near]):
+            kept.append((place, "a sharp bend", max(rest, _SHARP)))
+    return kept
+
+
+def _is_shared(place: Float64, line: Float64, counterpart: Float64, chain: Float64) -> bool:
+    """Whether the other view's chain, too, runs along the curve near a place: `line` and `counterpart`,
+    each (k, 2), are the curve in both views."""
+    near = np.linalg.norm(line - place, axis=1) <= _SAME_PLACE_PX
+    if not near.any() or len(chain) < 2:
+        return False
+    return coverage(chain, counterpart[near], _NEAR_PX) >= _AGREED
+
+
+def _is_one_pass(line: Float64, near: Int64) -> bool:
+    """Whether the curve passes a place, with those of its samples that are near, once."""
+    if len(near) < 2 or (np.diff(near) > 1).any():
+        return False
+    return polyline_length(line[near]) <= _ONE_PASS * _SAME_PLACE_PX
+
+
+def _is_all_ridge(place: Float64, line: Float64, near: Int64, ridges: Ridges) -> bool:
+    points = np.concatenate(ridges.segments)
+    around = points[np.linalg.norm(points - place, axis=1) <= _SAME_PLACE_PX]
+    foreign = around[cKDTree(line).query(around)[0] > _BESIDE_PX]
+    is_end = near[0] == 0 or near[-1] == len(line) - 1
+    level = 0.0 if is_end else _FAINT * float(np.median(ridges.sample(line)))
+    return len(foreign) < _FEW or int((ridges.sample(foreign) > level).sum()) < _FEW
+
+
+def _bends_sharply(passing: Float64) -> bool:
+    travelled = np.r_[0, np.cumsum(np.linalg.norm(np.diff(passing, axis=0), axis=1))]
+    at = np.arange(0.0, travelled[-1], 1.0)
+    even = np.c_[[np.interp(at, travelled, c) for c in passing.T]].T
+    steps = even[_BEND_REACH:] - even[:-_BEND_REACH]
+    steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
+    return bool(((steps[_BEND_REACH:] * steps[:-_BEND_REACH]).sum(1) < _SHARP_COSINE).any())
 
 
 def _is_near(where: Float64, places: Float64) -> bool:
