@@ -14,9 +14,10 @@ from suturetrack.tracking import gauss_newton, paper
 from suturetrack.tracking.alignment import shifted
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange
-from suturetrack.tracking.ends import EndWatch, doubled_ends, find_end
+from suturetrack.tracking.ends import EndStep, EndWatch, doubled_ends, find_end
 from suturetrack.tracking.energies import energies
 from suturetrack.tracking.motion import Motion
+from suturetrack.tracking.mouth import Mouth
 from suturetrack.tracking.reliability import (
     ASTRAY,
     RELIABILITY_SAMPLES,
@@ -85,6 +86,7 @@ class Follower:
         self._doubt = Doubt()
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
         self._share = 1.0
+        self._mouths = Mouth(), Mouth()
         self.model = Model(curve, Motion.none(), levels, now, now, EndWatch(length_of(curve), now))
 
     def remember(self, before: Follower) -> None:
@@ -272,12 +274,18 @@ class Follower:
 
     def _adjust_ends(self, field: RidgeField) -> None:
         model = self.model
-        steps = [find_end(model.curve, end, field, self.rig, model.levels) for end in (0, 1)]
+        steps = [self._end_step(end, field) for end in (0, 1)]
         start, stop = model.ends.moves(
             steps[0], steps[1], length_of(model.curve), field.stamp.capture_ns
         )
         if start or stop:
             model.curve = _with_ends(model.curve, -start, 1.0 + stop)
+
+    def _end_step(self, end: int, field: RidgeField) -> EndStep | None:
+        model, now_ns = self.model, field.stamp.capture_ns
+        step = find_end(model.curve, end, field, self.rig, model.levels)
+        other = self._mouths[1 - end]
+        return self._mouths[end].steady(step, model.curve, end, other, self.rig, now_ns)
 
     def _learn_levels(self, field: RidgeField) -> None:
         now = measure_levels(self.model.curve, field, self.rig)
