@@ -26,7 +26,7 @@ from services.bus import Bus
 from services.checks import check_name
 from services.fleet import Fleet, Launch
 from services.monitor import Monitor
-from services.service import ServiceConfig
+from services.service import ServiceConfig, SharedConfig
 from services.sources import InputConfig, open_input
 from services.zenoh_transport import (
     ZenohTransport,
@@ -55,7 +55,7 @@ class RunConfig:
     """Tracks the seeded threads of a source: starts source, segmenter and tracker and records them."""
 
     input: Annotated[InputConfig, tyro.conf.arg(name="")]
-    service: Annotated[ServiceConfig, tyro.conf.arg(name="")] = field(default_factory=ServiceConfig)
+    service: Annotated[SharedConfig, tyro.conf.arg(name="")] = field(default_factory=SharedConfig)
     seed: tuple[tuple[float, float], ...] = ()
     """U V of a pixel on the thread in the raw left image of the first frame; another pair for every
     further thread. The bench top knows its own."""
@@ -73,7 +73,7 @@ class RunConfig:
 class DemoConfig:
     """Tracks a thread on the synthetic bench top for 20 s, and records it."""
 
-    service: Annotated[ServiceConfig, tyro.conf.arg(name="")] = field(default_factory=ServiceConfig)
+    service: Annotated[SharedConfig, tyro.conf.arg(name="")] = field(default_factory=SharedConfig)
     scenario: str = "figure8-175"
     """What happens on the bench top."""
     view: bool = False
@@ -125,7 +125,8 @@ def _resolve(config: RunConfig, rig_name: str) -> tuple[RunConfig, StereoRig]:
     for pixel in seeds:
         seed_pixel(Seed(pixel=pixel), rig)
     run_dir = config.service.run_dir or _fresh_folder(config.input.source)
-    service = replace(config.service, rig=rig_name, run_dir=run_dir.absolute(), parent=os.getpid())
+    shared = replace(config.service, rig=rig_name, run_dir=run_dir.absolute())
+    service = ServiceConfig(**vars(shared), parent=os.getpid())
     return replace(config, seed=seeds, service=service), rig
 
 
@@ -152,7 +153,7 @@ def _make_run_folder(config: RunConfig, rig: StereoRig) -> None:
 
 
 @contextmanager
-def _reserved(service: ServiceConfig) -> Iterator[str]:
+def _reserved(service: SharedConfig) -> Iterator[str]:
     """The name of the rig, for this run alone; the default name gives way to a run that has it."""
     try:
         check_name(service.rig, "rig")
@@ -231,9 +232,9 @@ def _glances(monitor: Monitor, console: Console) -> Generator[None]:
         time.sleep(_GLANCE_S)
 
 
-def _show(service: ServiceConfig) -> subprocess.Popen[bytes]:
+def _show(service: SharedConfig) -> subprocess.Popen[bytes]:
     """The viewer, in a process that nobody waits for."""
-    options = arguments_of(ServiceConfig(rig=service.rig, zenoh=service.zenoh))
+    options = arguments_of(SharedConfig(rig=service.rig, zenoh=service.zenoh))
     return subprocess.Popen([sys.executable, "-m", "services.cli", "view", *options])
 
 

@@ -45,8 +45,8 @@ class Stopped(Exception):
 
 
 @dataclass(frozen=True)
-class ServiceConfig:
-    """What every process of a rig is told."""
+class SharedConfig:
+    """What all processes of a rig are told."""
 
     rig: str = "rig"
     """Name of the rig; keeps several apart."""
@@ -54,11 +54,18 @@ class ServiceConfig:
     """A Zenoh configuration file; without it, processes of this user on this machine find one another
     and nobody else does."""
     run_dir: Path | None = None
-    """Folder to record into; nothing is recorded without it."""
+    """Folder to record into. Without it a run makes one in `recordings`, and a process that is started by
+    itself records nothing."""
     recording: Literal["light", "full"] = "light"
     """light: JPEG images, states and energies; full: lossless images and the fields as numbers too."""
     lockstep: bool = False
     """Every frame, in order, the next one only when the tracker is done with this one."""
+
+
+@dataclass(frozen=True)
+class ServiceConfig(SharedConfig):
+    """What one process of a rig is told."""
+
     parent: int | None = None
     """Process id of the launcher: end when it has gone."""
     resume: int = 0

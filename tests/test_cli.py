@@ -14,7 +14,7 @@ from services import arguments, cli
 from services.launch import RunConfig
 from services.ros2_graph import RosConfig
 from services.segmenter import SegmenterConfig
-from services.service import ServiceConfig
+from services.service import ServiceConfig, SharedConfig
 from services.source import SourceConfig
 from services.sources import InputConfig
 from services.tracker import TrackerConfig
@@ -166,7 +166,7 @@ CONFIGS: list[Any] = [
         InitializationConfig(snap_px=4.5),
     ),
     TrackerConfig(),
-    RunConfig(InputConfig("x"), ServiceConfig(), ((1.0, 2.0),), True),
+    RunConfig(InputConfig("x"), SharedConfig(), ((1.0, 2.0),), True),
 ]
 
 
