@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -20,6 +20,7 @@ from suturetrack.contrast import (
     contrast_at,
 )
 from suturetrack.kernels import ridge
+from suturetrack.silhouette import is_cut_out, silhouette_scale, silhouettes
 from suturetrack.types import Float32, Float64, Image, InputError, RidgeField, Seed, StereoFrame
 
 Channel = Literal["learned", "gray", "blue", "green", "red"]
@@ -95,6 +96,7 @@ class Segmenter:
         width, height = rig.image_size
         self._views = _View(height, width, config), _View(height, width, config)
         self._steps = 0
+        self._is_cut_out = False
 
     @property
     def threads(self) -> tuple[str, ...]:
@@ -108,6 +110,7 @@ class Segmenter:
             InputError: the images are not uint8, gray or BGR, of the rig's size, and alike.
         """
         self._check(frame)
+        frame = self._seen(frame)
         slot = self._steps % _SLOTS
         self._steps += 1
         left, right = self._views
@@ -123,22 +126,29 @@ class Segmenter:
     def learn(self, frame: StereoFrame, seed: Seed) -> None:
         """Learn at `seed` what tells its thread from the surroundings: colours, width, contrast.
 
-        A seed with no ridge within 8 px teaches nothing. Of several threads, the mix suits all.
+        A seed with no ridge within 8 px teaches nothing. Of several threads, the mix suits all. Where
+        the thread was cut out of its picture, only its outline counts from then on.
 
         Raises:
             InputError: as `step`, or the seed lies outside the left image.
         """
         self._check(frame)
+        own = self._config.channel == "learned" and self._config.polarity == "auto"
+        self._is_cut_out = own and is_cut_out(frame)
+        frame = self._seen(frame)
         image = self._rig.rectify(frame.left, frame.right)[0]
         pixel = self._locate(seed)
         contrast = contrast_at(image, pixel)
         if contrast is not None:
+            if self._is_cut_out:
+                contrast = replace(contrast, sigma=max(silhouette_scale(frame.left), SIGMAS[0]))
             self._threads[seed.thread] = contrast
             self._relook()
 
     def forget(self, thread: str) -> None:
         """Look for a thread no more; without any, look as before the first was learned."""
         if self._threads.pop(thread, None) is not None:
+            self._is_cut_out &= bool(self._threads)
             self._relook()
 
     def adapt(self, frame: StereoFrame, pixels: Float64, thread: str = "0") -> None:
@@ -154,6 +164,7 @@ class Segmenter:
             InputError: as `step`.
         """
         self._check(frame)
+        frame = self._seen(frame)
         width, height = self._rig.image_size
         inside = (pixels >= 0).all(1) & (pixels <= (width - 1, height - 1)).all(1)
         learned = self._config.adapt and thread in self._threads
@@ -184,6 +195,9 @@ class Segmenter:
                 )
         if frame.left.ndim != frame.right.ndim:
             raise InputError("one image is gray and the other in colour; both must be alike")
+
+    def _seen(self, frame: StereoFrame) -> StereoFrame:
+        return silhouettes(frame) if self._is_cut_out else frame
 
     def _locate(self, seed: Seed) -> tuple[float, float]:
         if seed.pixel is not None:

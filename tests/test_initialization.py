@@ -246,6 +246,28 @@ def test_a_highlight_between_rims_is_no_crossing(
     assert (found.confidence > 0.7) == is_found
 
 
+@pytest.mark.parametrize("ground", [0, 255])
+def test_of_a_thread_that_was_cut_out_only_the_outline_counts(
+    rig: StereoRig, curve: Nurbs, ground: int
+) -> None:
+    """It grows wide, and its middle and other stretches have the colour of the ground, nearly."""
+    truth, stretch = dense(curve), slice(500, 620)
+    near, far = abs(ground - 6), abs(ground - 180)
+    views = []
+    for pixels in rig.project(truth):
+        outline = draw(pixels[stretch], rig, draw(pixels, rig), width=7) < 130
+        core = draw(pixels[510:610], rig) < 130
+        core |= draw(pixels[1000:1030], rig, width=7) < 130
+        shade = np.where(core, near, far)
+        views.append(np.where(outline, shade, ground).astype(np.uint8))
+    frame, seed = StereoFrame(STAMP, *views), Seed(pixel=tuple(rig.project(truth[900])[0]))
+    segmenter = Segmenter(rig)
+    segmenter.learn(frame, seed)
+    found = initialize(segmenter.step(frame), rig, seed)
+    assert abs(curve_error(dense(found.curve), truth).length_percent) < 3
+    assert found.confidence > 0.7
+
+
 def test_straight_stretches_take_few_control_points(rig: StereoRig) -> None:
     line = np.linspace([-30.0, -25, 190], [40.0, 30, 205], 1500)
     left, right = rig.project(line)

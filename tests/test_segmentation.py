@@ -21,6 +21,7 @@ from suturetrack.segmentation import (
     direction_key,
     gaussian_kernel,
 )
+from suturetrack.silhouette import is_cut_out
 from suturetrack.stage import Scene, open_scene
 from suturetrack.stage.appearance import Picture
 from suturetrack.types import Float32, Float64, Image, InputError, Seed, Stamp, StereoFrame
@@ -620,3 +621,11 @@ def test_the_key_shows_every_direction_in_its_colour() -> None:
         at = np.array([u - 32, v - 32], np.float32) / np.hypot(u - 32, v - 32)
         expected = direction_image(at[None, None])[0, 0].astype(int)
         np.testing.assert_allclose(key[v, u], expected, atol=12)
+
+
+@pytest.mark.parametrize("hard", [True, False])
+def test_a_thread_is_taken_for_cut_out_where_its_rim_is_hard(hard: bool) -> None:
+    row = np.abs(np.arange(100) - 50.2)[:, None] + np.zeros((1, 120))
+    share = (row < 2).astype(float) if hard else expit(2 * (2 - row))
+    left = np.rint(255 - 150 * share).astype(np.uint8)
+    assert is_cut_out(StereoFrame(STAMP, left, left)) == hard
