@@ -27,6 +27,7 @@ _WIDTH, _HEIGHT, _LEFT, _BOTTOM = 1000, 180, 64, 22
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2rem auto; color: #222; }
 pre { font-size: 12.5px; line-height: 1.25; overflow-x: auto; }
+h2 small, h3 small { font-weight: normal; margin-left: 0.7em; }
 svg { width: 100%; } svg text { font-size: 11px; fill: #555; }
 figure { margin: 1rem 0; } figure img { width: 100%; } figcaption { color: #555; }
 """
@@ -37,7 +38,7 @@ def page(folder: RunFolder, summary: RunSummary) -> str:
     parts = [f"<h1>{html.escape(summary.name)}</h1>", _tables(summary)]
     rig = folder.rig()
     for thread, course in zip(summary.threads, summary.courses, strict=True):
-        parts.append(f"<h2>Thread {html.escape(thread.thread)}</h2>")
+        parts.append(f"<h2>Thread {html.escape(thread.thread)}{_key(_COLORS.items())}</h2>")
         parts += _plots(course)
         parts += _key_frames(folder, thread, course, rig)
     head = f"<meta charset='utf-8'><title>{html.escape(summary.name)}</title>"
@@ -89,14 +90,18 @@ def _plot(title: str, course: Course, lines: dict[str, Float64]) -> str:
             f"<line x1='{_LEFT}' x2='{_WIDTH}' y1='{at:.1f}' y2='{at:.1f}' stroke='#ddd'/>"
             f"<text x='{_LEFT - 6}' y='{at + 4:.1f}' text-anchor='end'>{level:g}</text>"
         )
-    for (name, y), color, k in zip(lines.items(), _LINES, range(len(lines)), strict=False):
-        drawn.append(_line(x, height(y), color))
-        drawn.append(f"<text x='{_LEFT + 10 + 120 * k}' y='14' style='fill:{color}'>{name}</text>")
+    colors = dict(zip(lines, _LINES, strict=False))
+    drawn += [_line(x, height(y), colors[name]) for name, y in lines.items()]
     drawn += [
         f"<text x='{_LEFT}' y='{_HEIGHT - 2}'>frame {first}</text>",
         f"<text x='{_WIDTH}' y='{_HEIGHT - 2}' text-anchor='end'>frame {last}</text>",
     ]
-    return f"<h3>{title}</h3><svg viewBox='0 0 {_WIDTH} {_HEIGHT}'>{''.join(drawn)}</svg>"
+    return f"<h3>{title}{_key(colors.items())}</h3><svg viewBox='0 0 {_WIDTH} {_HEIGHT}'>{''.join(drawn)}</svg>"
+
+
+def _key(colors: Iterable[tuple[str, str]]) -> str:
+    """Names in their colours, beside a heading."""
+    return "".join(f" <small style='color:{color}'>{name}</small>" for name, color in colors)
 
 
 def _line(x: Float64, y: Float64, color: str) -> str:

@@ -97,7 +97,7 @@ def _energies(threads: list[ThreadSummary]) -> Table:
 
 def _errors(threads: list[ThreadSummary]) -> Table:
     table = new_table(
-        f"Distance from the truth, mean over the curve (wrong: called tracking, but over {WRONG_PX:g} px)",
+        f"Distance from the truth, mean over the curve (wrong: over {WRONG_PX:g} px)",
         *("thread", "p50 mm", "p95 mm", "worst mm", "p50 px", "worst px", "at frame"),
         "wrong %",
     )
