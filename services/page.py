@@ -96,7 +96,8 @@ def _plot(title: str, course: Course, lines: dict[str, Float64]) -> str:
         f"<text x='{_LEFT}' y='{_HEIGHT - 2}'>frame {first}</text>",
         f"<text x='{_WIDTH}' y='{_HEIGHT - 2}' text-anchor='end'>frame {last}</text>",
     ]
-    return f"<h3>{title}{_key(colors.items())}</h3><svg viewBox='0 0 {_WIDTH} {_HEIGHT}'>{''.join(drawn)}</svg>"
+    heading = f"<h3>{title}{_key(colors.items())}</h3>"
+    return f"{heading}<svg viewBox='0 0 {_WIDTH} {_HEIGHT}'>{''.join(drawn)}</svg>"
 
 
 def _key(colors: Iterable[tuple[str, str]]) -> str:
