@@ -13,6 +13,10 @@ _OFFSETS = np.arange(-4.0, 4.01, 0.5)
 """Where the crest is looked for across the curve, px."""
 _NEAR_PX = 2.0
 """How far the crest is expected from the curve, px (standard deviation)."""
+_WIDE = 1.15
+"""Squared width of a ridge, against the usual one, from which another strand is in it."""
+_WIDENED = 12
+"""Power of the width beyond that by which such a crest counts less."""
 _CENTROID_REACH = 4
 """Offsets on each side of the peak whose centroid is the crest."""
 
@@ -27,11 +31,14 @@ class Crest:
     """(k,) signed distance from the curve to the crest along the normal, px; 0 where it is unseen."""
     response: Float64
     """(k,) eq. (4)'s integrand at the crest, in [0, 1]; 0 where it is unseen."""
+    clear: Float64
+    """(k,) in [0, 1]; low where the ridge is wider than elsewhere: another strand draws its crest
+    aside."""
 
     @property
     def trust(self) -> Float64:
         """(k,) weights of the offsets: crests far off are more often another's."""
-        return self.response / (1 + self.offsets**2)
+        return self.clear * self.response / (1 + self.offsets**2)
 
 
 def find_crest(field: Float32, pixels: Float64) -> Crest:
@@ -48,6 +55,11 @@ def find_crest(field: Float32, pixels: Float64) -> Crest:
     total = window.sum(1)
     seen = (peak > 0) & (peak < len(_OFFSETS) - 1) & (total > 0)
     offsets = (window * _OFFSETS[index]).sum(1) / np.maximum(total, 1e-12)
+    spread = (window * (_OFFSETS[index] - offsets[:, None]) ** 2).sum(1) / np.maximum(total, 1e-12)
+    usual = float(np.median(spread[seen])) if seen.any() else 1.0
+    wider = np.maximum(spread / max(_WIDE * usual, 1e-12), 1.0)
     heights = np.take_along_axis(profiles, peak[:, None], 1)[:, 0]
     normals = np.c_[-tangents[:, 1], tangents[:, 0]]
-    return Crest(normals, np.where(seen, offsets, 0.0), np.where(seen, heights, 0.0))
+    return Crest(
+        normals, np.where(seen, offsets, 0.0), np.where(seen, heights, 0.0), wider**-_WIDENED
+    )

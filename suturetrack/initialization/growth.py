@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.model import InitializationConfig, ViewGrowth
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import follow, merge_ends
@@ -63,9 +64,11 @@ class Thread:
         return [self.ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in self.entries]
 
 
-def follow_thread(ridges: Ridges, origin: int, config: InitializationConfig) -> Thread:
+def follow_thread(
+    ridges: Ridges, origin: int, config: InitializationConfig, depth: Depth | None = None
+) -> Thread:
     """The merged segments through segment `origin`."""
-    merged = merge_ends(ridges, config)
+    merged = merge_ends(ridges, config, depth)
     ridges = replace(ridges, segments=merged.segments)
     entries = _without_faint_ends(ridges, follow(origin, merged.partner), origin)
     doubts = tuple(

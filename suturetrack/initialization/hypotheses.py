@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.initialization.confidence import clarity
+from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.growth import Chain, Thread, follow_thread, nearest_segment
 from suturetrack.initialization.matching import Match, match
 from suturetrack.initialization.model import InitializationConfig
@@ -72,11 +73,22 @@ def find_thread(
     """
     left = follow_thread(ridges[0], origin, config)
     matched = match(left.chain, field.left, field.right, nearest, 1)
+    apart = (left.chain.pixels - matched.pixels)[matched.inside, 0]
+    if len(apart):
+        left = follow_thread(
+            ridges[0], origin, config, Depth.around(apart, field.left, field.right)
+        )
+        matched = match(left.chain, field.left, field.right, nearest, 1)
     there = matched.pixels[_closest(left.chain.pixels, seed)]
     partner, _ = nearest_segment(ridges[1], there, np.inf)
     if partner is None:
         return Hypothesis(left, None, matched)
-    right = follow_thread(ridges[1], partner, config)
+    right = follow_thread(
+        ridges[1],
+        partner,
+        config,
+        Depth.around(-apart, field.right, field.left) if len(apart) else None,
+    )
     first = Hypothesis(left, right, matched)
     if _agreement(matched.pixels[matched.inside], right.chain.pixels) >= AGREED:
         return first

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.initialization.growth import Chain
+from suturetrack.initialization.segments import chain_tangents
 from suturetrack.kernels import matching as kernel
 from suturetrack.kernels import search
 from suturetrack.types import Bool, Float32, Float64
@@ -92,11 +93,3 @@ def raised(view: Float32, rows: int) -> Float32:
     # As fields from the wire are: kernels are compiled apart for arrays that may be written to.
     moved.flags.writeable = False
     return moved
-
-
-def chain_tangents(pixels: Float64, reach: int = 3) -> Float64:
-    """(k, 2) unit tangents of a chain with points one pixel apart."""
-    ahead = pixels[np.minimum(np.arange(len(pixels)) + reach, len(pixels) - 1)]
-    behind = pixels[np.maximum(np.arange(len(pixels)) - reach, 0)]
-    t = ahead - behind
-    return t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-9)

@@ -188,6 +188,14 @@ def _apart(cuts: list[int]) -> list[int]:
     return [c for i, c in enumerate(cuts) if i == 0 or c - cuts[i - 1] > _NEAR_PX]
 
 
+def chain_tangents(pixels: Float64, reach: int = 3) -> Float64:
+    """(k, 2) unit tangents of a chain with points one pixel apart."""
+    ahead = pixels[np.minimum(np.arange(len(pixels)) + reach, len(pixels) - 1)]
+    behind = pixels[np.maximum(np.arange(len(pixels)) - reach, 0)]
+    t = ahead - behind
+    return t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-9)
+
+
 def _sub_pixel(field: Float32, magnitude: Float32, pixels: Float64) -> Float64:
     """Moves pixels along the normal to the vertex of the parabola through three values of ||V||."""
     v = field[pixels[:, 1], pixels[:, 0]]

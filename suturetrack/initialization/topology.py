@@ -7,26 +7,16 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.model import InitializationConfig
+from suturetrack.initialization.pricing import FREE_END, TOUCHING_PX, Merge, price_merges
 from suturetrack.initialization.segments import ARM, Ridges
-from suturetrack.kernels import search
-from suturetrack.types import Bool, Float64
+from suturetrack.initialization.strands import REACH, Strands
+from suturetrack.types import Float64
 
 Int64 = NDArray[np.int64]
 
-_CLEAR = 2
-"""Points at the very end of a segment that the other ridges of a junction have drawn aside."""
-_HOOKED = 7
-"""Points at the end of a segment that a highlight beside it may have drawn aside."""
-_SHORT = 0.25
-"""Price of a merge with a segment too short to have a direction."""
-_TOUCHING_PX = 6.0
-"""Ends this near over ridge belong together at any angle: a sharp bend."""
-_BRIDGE_SAMPLES = 12
-_SWING = 0.01
-"""Price of a bridge that bends one way and then the other."""
 _REASSURANCE = 0.3
 """Share of its lead over the next best way that the price of a merge is less doubtful by."""
 _STRAIN = 1.5
@@ -35,20 +25,8 @@ _RUNS_ON = 0.55
 """Price of a merge below which an end might as well run on."""
 _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""
-_FREE_END = 0.5
-"""Price of an end without a partner: two of them make the highest price of a merge."""
-
-
-@dataclass(frozen=True, eq=False)
-class Merge:
-    """What joining pairs of ends would cost; end 2i is the start of segment i, 2i + 1 its end."""
-
-    pairs: Int64
-    """(m, 2)."""
-    cost: Float64
-    """(m,) 1 is the highest price that is paid."""
-    touching: Bool
-    """(m,) whether ridge joins the two ends, whatever their angle."""
+_CLEARLY = 0.03
+"""By how much less two strands have to cost in all if their far parts are swapped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +47,9 @@ class Merged:
         found = []
         for entry in entries[1:]:
             price = self.price[entry, self.partner[entry]]
-            lead = min(self._lead(entry, entries, within), _FREE_END)
+            lead = min(self._lead(entry, entries, within), FREE_END)
             strain = price - _REASSURANCE * lead
-            if price >= 2 * _FREE_END:
+            if price >= 2 * FREE_END:
                 found.append((entry, "a sharp bend", 0.6))
             elif strain > 0:
                 rest = max(1 - _STRAIN * strain, 0.1)
@@ -104,14 +82,23 @@ class Merged:
         others.append(segment[: -2 * ARM] if tip % 2 else segment[2 * ARM :])
         points = np.concatenate(others)
         distance = np.linalg.norm(points - segment[-(tip % 2)], axis=1)
-        return bool(len(points) and distance.min() < _TOUCHING_PX)
+        return bool(len(points) and distance.min() < TOUCHING_PX)
 
 
-def merge_ends(ridges: Ridges, config: InitializationConfig) -> Merged:
-    """Pairs up the ends so that all merges and free ends together cost least (almost: by exchange)."""
+def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None = None) -> Merged:
+    """Pairs up the ends so that all merges and free ends together cost least (almost: by exchange).
+
+    With `depth`, ends whose arms differ in depth are dearer to join.
+    """
     if not ridges.segments:
         return Merged((), {}, {})
     merges = price_merges(ridges, config)
+    first = _merge(ridges, merges, None)
+    strands = Strands(first.segments, first.partner, merges, depth)
+    return _merge(ridges, strands.with_depth(merges), strands)
+
+
+def _merge(ridges: Ridges, merges: Merge, strands: Strands | None) -> Merged:
     price = {
         (int(i), int(j)): float(c) for (i, j), c in zip(merges.pairs, merges.cost, strict=True)
     }
@@ -120,19 +107,58 @@ def merge_ends(ridges: Ridges, config: InitializationConfig) -> Merged:
     order = np.argsort(merges.cost)
     _pair(partner, merges.pairs[order[merges.cost[order] < 1]])
     _exchange(partner, price)
-    segments = _share(ridges.segments, partner, price)
+    if strands is not None:
+        _uncross(ridges.segments, partner, price, strands)
+    segments = _share(ridges.segments, partner, price, strands)
     _open_rings(partner, price)
     _pair(partner, merges.pairs[order[merges.touching[order]]])
     return Merged(segments, partner, price)
 
 
+def _uncross(
+    segments: tuple[Float64, ...],
+    partner: dict[int, int],
+    price: dict[tuple[int, int], float],
+    strands: Strands,
+) -> None:
+    """Where one strand leads through a short segment and another beside it, swaps their far parts if
+    these fit better so: short segments say little about direction."""
+    within = _within_reach(price)
+    for k, segment in enumerate(segments):
+        start, stop = 2 * k, 2 * k + 1
+        if len(segment) >= REACH or start not in partner or stop not in partner:
+            continue
+        a, b = partner[start], partner[stop]
+        for c in within.get(start, ()):
+            d = partner.get(c, -1)
+            if c in (a, b) or d in (a, b, start, stop) or d not in within.get(stop, ()):
+                continue
+            change = strands.change([(a, b), (c, d)], [(a, d), (c, b)])
+            if change is None:
+                continue
+            ways = [
+                (price[stop, d] + price.get((c, b), 2.0) - price[stop, b], (stop, d), (c, b)),
+                (price[start, c] + price.get((a, d), 2.0) - price[start, a], (start, c), (a, d)),
+            ]
+            added, *pairs = min(ways)
+            if added - price[c, d] + change < -_CLEARLY:
+                for i, j in pairs:
+                    partner[i], partner[j] = j, i
+                    price.setdefault((i, j), FREE_END)
+                    price.setdefault((j, i), FREE_END)
+                break
+
+
 def _share(
-    segments: tuple[Float64, ...], partner: dict[int, int], price: dict[tuple[int, int], float]
+    segments: tuple[Float64, ...],
+    partner: dict[int, int],
+    price: dict[tuple[int, int], float],
+    strands: Strands | None,
 ) -> tuple[Float64, ...]:
     """Doubles the runs of segments that a second strand waits for at both ends."""
     waiting: dict[int, tuple[float, int]] = {}
     for (i, j), cost in price.items():
-        if i in partner and j not in partner and cost < 2 * _FREE_END:
+        if i in partner and j not in partner and cost < 2 * FREE_END:
             waiting[i] = min(waiting.get(i, (np.inf, -1)), (cost, j))
     found = [(waiting[run[0]][0] + waiting[run[-1] ^ 1][0], run) for run in _runs(waiting, partner)]
     copies = list(segments)
@@ -144,7 +170,7 @@ def _share(
         if any(e // 2 in taken for e in run):
             continue
         taken.update(e // 2 for e in run)
-        _double(run, one, other, copies, partner, price)
+        _double(run, one, other, copies, partner, price, strands)
     return tuple(copies)
 
 
@@ -170,6 +196,7 @@ def _double(
     copies: list[Float64],
     partner: dict[int, int],
     price: dict[tuple[int, int], float],
+    strands: Strands | None,
 ) -> None:
     """Leads a second strand, which waits with the ends `one` and `other`, through a run."""
     start, stop = run[0], run[-1] ^ 1
@@ -179,8 +206,12 @@ def _double(
     if ring or other == _leads_to(first, partner) or one == _leads_to(last, partner):
         swap = ring
     else:
-        straight = price.get((one, other), 2.0) + price.get((first, last), 2.0)
-        swap = price.get((one, last), 2.0) + price.get((first, other), 2.0) < straight
+        straight, crossed = [(one, other), (first, last)], [(one, last), (first, other)]
+        change = None if strands is None else strands.change(straight, crossed)
+        if change is None:
+            change = sum(price.get(p, 2.0) for p in crossed)
+            change -= sum(price.get(p, 2.0) for p in straight)
+        swap = change < 0
     copied = {}
     for entry in run:
         for end in (entry, entry ^ 1):
@@ -208,7 +239,7 @@ def _open_rings(partner: dict[int, int], price: dict[tuple[int, int], float]) ->
             if a not in ring and (i, a) in price
         ]
         added, i, j, a, b = min(ways, default=(np.inf, 0, 0, 0, 0))
-        if added < 2 * _FREE_END:
+        if added < 2 * FREE_END:
             for one, other in ((i, a), (j, b)):
                 partner[one], partner[other] = other, one
 
@@ -267,7 +298,7 @@ def _exchange(partner: dict[int, int], price: dict[tuple[int, int], float]) -> N
     while improved:
         improved = False
         for i, j in list(price):
-            if partner.get(i) == j or price[i, j] >= 2 * _FREE_END:
+            if partner.get(i) == j or price[i, j] >= 2 * FREE_END:
                 continue
             added, left, pairs = _swap(i, j, partner, price, within)
             if added < -1e-9:
@@ -281,7 +312,7 @@ def _exchange(partner: dict[int, int], price: dict[tuple[int, int], float]) -> N
 def _within_reach(price: dict[tuple[int, int], float]) -> dict[int, list[int]]:
     within: dict[int, list[int]] = {}
     for (i, j), cost in price.items():
-        if cost < 2 * _FREE_END:
+        if cost < 2 * FREE_END:
             within.setdefault(i, []).append(j)
     return within
 
@@ -298,82 +329,15 @@ def _swap(
 
     def paid(end: int) -> float:
         if end not in partner:
-            return _FREE_END
-        return min(price[end, partner[end]], 2 * _FREE_END)
+            return FREE_END
+        return min(price[end, partner[end]], 2 * FREE_END)
 
     left = [partner[end] for end in (i, j) if end in partner]
-    ways: list[tuple[float, list[tuple[int, int]]]] = [(_FREE_END * len(left), [])]
+    ways: list[tuple[float, list[tuple[int, int]]]] = [(FREE_END * len(left), [])]
     if len(left) == 2 and left[1] in within.get(left[0], ()):
         ways.append((price[left[0], left[1]], [(left[0], left[1])]))
     if len(left) == 1:
         free = [k for k in within.get(left[0], ()) if k not in partner and k not in (i, j)]
-        ways += [(price[left[0], k] - _FREE_END, [(left[0], k)]) for k in free]
+        ways += [(price[left[0], k] - FREE_END, [(left[0], k)]) for k in free]
     cost, pairs = min(ways)
     return price[i, j] + cost - paid(i) - paid(j), left, [(i, j), *pairs]
-
-
-def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
-    """Prices every pair of ends within reach: whether one smooth curve runs through both segments,
-    over ridge, at one strength."""
-    looks = [
-        [a for s in ridges.segments for a in (_arm(s, clear), _arm(s[::-1], clear))]
-        for clear in (_CLEAR, _HOOKED)
-    ]
-    positions = np.array([a[0] for a in looks[0]])
-    near = np.array([ridges.sample(a).mean() for a in looks[0]])
-    # A highlight at a junction fades one arm of a segment, and not the segment.
-    whole = np.repeat([np.median(ridges.sample(s)) for s in ridges.segments], 2)
-    short = np.repeat([max(1 - len(s) / ARM, 0.0) for s in ridges.segments], 2)
-    pairs = cKDTree(positions).query_pairs(2 * config.gap_px, output_type="ndarray")
-    pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
-    cost, touching = np.empty(len(pairs)), np.zeros(len(pairs), bool)
-    for k, (i, j) in enumerate(pairs):
-        distance = float(np.linalg.norm(positions[j] - positions[i]))
-        shape, weakest = _bridge_price(looks[0][i], looks[0][j], ridges, config)
-        if shape > _FREE_END and distance < 2 * _TOUCHING_PX:
-            shape = min(shape, _bridge_price(looks[1][i], looks[1][j], ridges, config)[0])
-        ratio = min(abs(float(np.log(s[i] / s[j]))) for s in (near, whole))
-        cost[k] = shape + 0.25 * ratio**2 + _SHORT * max(short[i], short[j])
-        touching[k] = distance < _TOUCHING_PX and weakest >= config.low
-    return Merge(pairs, cost, touching)
-
-
-def _arm(segment: Float64, clear: int) -> Float64:
-    first = min(clear, len(segment) // 4)
-    return segment[first : first + ARM - _CLEAR]
-
-
-def _bridge_price(
-    one: Float64, other: Float64, ridges: Ridges, config: InitializationConfig
-) -> tuple[float, float]:
-    """What a smooth curve through two arms costs by its shape and the ridge below it, and the least
-    ||V|| between them."""
-    misfit, swing, bridge = _common_curve(one, other)
-    distance = float(np.linalg.norm(other[0] - one[0]))
-    seen, weakest = _evidence(ridges, bridge, config)
-    missing = (1 - seen) * distance / config.gap_px
-    return misfit + _SWING * swing**2 + missing + 0.1 * distance / config.gap_px, weakest
-
-
-def _common_curve(one: Float64, other: Float64) -> tuple[float, float, Float64]:
-    """A cubic through both arms: its mean squared misfit, px^2, by how many radians per length its
-    curvature changes over it, and the cubic between the arms."""
-    distance = float(np.linalg.norm(other[0] - one[0]))
-    t = np.r_[-np.arange(len(one), dtype=float), distance + np.arange(len(other))]
-    scale = max(abs(t).max(), 1.0)
-    design = np.vander(t / scale, 4)
-    points = np.r_[one, other]
-    coefficients, *_ = np.linalg.lstsq(design, points, rcond=None)
-    misfit = float((((design @ coefficients - points) ** 2).sum(1)).mean())
-    swing = 6 * float(np.linalg.norm(coefficients[0])) / scale**3 * float(np.ptp(t)) ** 2
-    between = np.linspace(0, distance, _BRIDGE_SAMPLES) / scale
-    return misfit, swing, np.vander(between, 4) @ coefficients
-
-
-def _evidence(ridges: Ridges, bridge: Float64, config: InitializationConfig) -> tuple[float, float]:
-    """Share of the bridge that is on ridge of its direction, and the least ||V|| on it."""
-    tangents = np.gradient(bridge, axis=0)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    along = search.responses(ridges.field, bridge, tangents)
-    share = float(np.clip(along / config.high, 0, 1).mean())
-    return share, float(ridges.sample(bridge).min())

@@ -1,0 +1,77 @@
+"""Which arms of a crossing are one strand, by their depth and by how they bend."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from suturetrack.camera import StereoRig
+from suturetrack.initialization.depth import Depth
+from suturetrack.initialization.pricing import Merge
+from suturetrack.initialization.strands import Strands
+from suturetrack.types import Float32, Float64
+from tests.test_initialization import draw, field_of
+
+DISPARITY = 160.0
+
+
+def two_views(
+    arms: list[Float64], disparities: list[float], rig: StereoRig
+) -> tuple[Float32, Float32]:
+    left, right = None, None
+    for arm, disparity in zip(arms, disparities, strict=True):
+        left = draw(arm, rig, left)
+        right = draw(arm - [disparity, 0.0], rig, right)
+    assert left is not None
+    assert right is not None
+    field = field_of(left, right, rig)
+    return field.left, field.right
+
+
+def crossing() -> list[Float64]:
+    """One arm from above, and two below it that go on as well in the image."""
+    run = np.arange(0.0, 61.0)
+    above = np.c_[np.full(61, 400.0), 200 - run]
+    ways = [np.c_[400 + side * (2 + 0.15 * run), 212 + run] for side in (-1, 1)]
+    return [above, *ways]
+
+
+def test_an_arm_is_found_in_the_other_view(rig: StereoRig) -> None:
+    arms = crossing()
+    left, right = two_views(arms, [DISPARITY, DISPARITY + 4.3, DISPARITY - 2.6], rig)
+    depth = Depth.around(np.full(10, DISPARITY), left, right)
+    for arm, disparity in zip(arms, (0.0, 4.3, -2.6), strict=True):
+        found = depth.along(arm)
+        assert found is not None
+        assert np.abs(found.value - DISPARITY - disparity).max() < 0.3
+    assert depth.along(np.c_[300 + np.arange(61.0), np.full(61, 100.0)]) is None
+
+
+@pytest.mark.parametrize(("steps", "dearer"), [((0.0, 4.0), 1), ((-4.0, 0.0), 0)])
+def test_a_step_in_depth_makes_a_merge_dearer(
+    rig: StereoRig, steps: tuple[float, float], dearer: int
+) -> None:
+    arms = crossing()
+    left, right = two_views(arms, [DISPARITY, *(DISPARITY + s for s in steps)], rig)
+    merges = Merge(np.array([[0, 2], [0, 4]]), np.array([0.3, 0.3]), np.zeros(2, bool))
+    depth = Depth.around(np.full(10, DISPARITY), left, right)
+    cost = Strands(tuple(arms), {}, merges, depth).with_depth(merges).cost
+    assert cost[dearer] > cost[1 - dearer] + 0.2
+    assert cost[1 - dearer] == pytest.approx(0.3, abs=0.1)
+    np.testing.assert_array_equal(
+        Strands(tuple(arms), {}, merges, None).with_depth(merges).cost, merges.cost
+    )
+
+
+def test_strands_that_cross_go_straight_on() -> None:
+    run = np.arange(8.0, 69.0)
+    ends = [np.c_[300 + way * run, 200 + side * 0.7 * run] for way in (-1, 1) for side in (-1, 1)]
+    merges = Merge(np.empty((0, 2), np.int64), np.empty(0), np.empty(0, bool))
+    strands = Strands(tuple(ends), {}, merges, None)
+    straight, touching = [(0, 6), (2, 4)], [(0, 4), (2, 6)]
+    change = strands.change(straight, touching)
+    assert change is not None
+    assert change > 0.2
+    assert strands.change(touching, straight) == pytest.approx(-change)
+    short = Strands(tuple(e[:5] for e in ends), {}, merges, None)
+    assert short.change(straight, touching) is None
