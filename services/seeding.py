@@ -25,7 +25,6 @@ _ON_ITS_WAY_NS = 5_000_000
 @dataclass
 class _Case:
     seed: Seed
-    attempts: int
     request: Request[Seed, SeedReply] | None
     reason: str = "no field came in which to look for the thread"
     waits: int = 0
@@ -38,16 +37,13 @@ class SeedDesk:
     """Hands seeds to the tracker, and tells whoever asked what was found.
 
     Args:
-        patience: fields in which the tracker looks for a thread.
         at_once: look in the next field, for lock-step, instead of the first one that was segmented with
             the thread's colour known.
     """
 
-    def __init__(
-        self, bus: Bus, tracker: Tracker, rig: StereoRig, patience: int, *, at_once: bool = False
-    ):
+    def __init__(self, bus: Bus, tracker: Tracker, rig: StereoRig, *, at_once: bool = False):
         self._at_once = at_once
-        self._bus, self._tracker, self._rig, self._patience = bus, tracker, rig, patience
+        self._bus, self._tracker, self._rig = bus, tracker, rig
         self._requests = bus.requests(topics.SEED)
         self._forgets = bus.requests(topics.FORGET)
         self._cases: dict[str, _Case] = {}
@@ -67,7 +63,7 @@ class SeedDesk:
         before = self._cases.pop(seed.thread, None)
         if before is not None:
             _answer(before, SeedReply(seed.thread, False, "another seed took its place"))
-        case = self._cases[seed.thread] = _Case(seed, self._patience, request)
+        case = self._cases[seed.thread] = _Case(seed, request)
         return case
 
     def resume(self, given: Iterable[Seed]) -> None:
@@ -136,12 +132,11 @@ class SeedDesk:
             case = self._cases.get(thread)
             if case is None or case.waits:
                 continue
-            case.attempts -= 1
             if isinstance(result, Initialization):
                 _answer(case, self._found(thread, stamp, result))
             else:
                 case.reason = result.reason
-                if case.attempts > 0:
+                if self._tracker.is_sought(thread):
                     continue
                 if case.request is None:
                     raise InputError(_failure(case))

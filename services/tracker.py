@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -17,8 +18,8 @@ from services.seeding import SeedDesk
 from services.service import Service, ServiceConfig, Stopped, compiling
 from services.wire import scaled
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import InitializationConfig
-from suturetrack.tracking import Tracker, TrackingConfig
+from suturetrack.initialization import Initialization, InitializationConfig, InitializationError
+from suturetrack.tracking import Tracker, TrackerStep, TrackingConfig
 from suturetrack.types import RidgeField, Seed, Stamp
 
 
@@ -39,7 +40,7 @@ def run(service: Service, config: TrackerConfig) -> None:
     bus = service.bus
     rig = service.calibrated_rig()
     tracker = Tracker(rig, config.tracking, config.initialization)
-    desk = SeedDesk(bus, tracker, rig, config.tracking.patience, at_once=config.service.lockstep)
+    desk = SeedDesk(bus, tracker, rig, at_once=config.service.lockstep)
     grasps = GraspDesk(bus, rig)
     with compiling():
         warm_up(rig, config)
@@ -71,15 +72,26 @@ def run(service: Service, config: TrackerConfig) -> None:
             bus.publish(topics.STATE, scaled(state, rig.metres_per_unit))
         grasps.update(step.states)
         published_ns = service.finished(ridges.stamp)
-        recorder.initializations(ridges, desk.seeds, step.initializations)
+        for looked_in, found in _by_field(step):
+            recorder.initializations(looked_in, desk.seeds, found)
         if step.states:
             recorder.states(step.states, published_ns)
         else:
             recorder.passed(ridges.stamp, published_ns)
-        desk.settle(ridges.stamp, step.initializations)
+        for looked_in, found in _by_field(step):
+            desk.settle(looked_in.stamp, found)
         # The last word: in lock-step, all that was said of this frame is there before the next one.
         bus.publish(topics.STEP, ridges.stamp)
     desk.close()
+
+
+def _by_field(
+    step: TrackerStep,
+) -> Iterator[tuple[RidgeField, dict[str, Initialization | InitializationError]]]:
+    """What came of looking for threads, by the field in which they were looked for."""
+    for looked_in in dict.fromkeys(step.looked_in.values()):
+        names = [name for name, other in step.looked_in.items() if other is looked_in]
+        yield looked_in, {name: step.initializations[name] for name in names}
 
 
 def warm_up(rig: StereoRig, config: TrackerConfig) -> None:

@@ -307,7 +307,7 @@ def test_a_doubtful_start_is_not_called_tracking_until_a_look_is_sure(
         looks.append(found)
         return replace(found, confidence=0.4 if len(looks) < 3 else 0.9)
 
-    monkeypatch.setattr("suturetrack.tracking.tracker.initialize", doubtful_at_first)
+    monkeypatch.setattr("suturetrack.tracking.recovery.initialize", doubtful_at_first)
     truths = [thread(i / FPS) for i in range(60)]
     fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
     states = follow(fields, rig, seed_on(rig, truths[0]))
@@ -332,7 +332,7 @@ def test_a_sure_look_at_another_thread_does_not_count(
         found = initialize(field, rig, seed)
         return replace(found, confidence=0.4 if len(looks) == 1 else 0.9)
 
-    monkeypatch.setattr("suturetrack.tracking.tracker.initialize", strays)
+    monkeypatch.setattr("suturetrack.tracking.recovery.initialize", strays)
     tracker = Tracker(rig)
     for name, points in zip("ab", pair, strict=True):
         tracker.seed(seed_on(rig, points, name))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from suturetrack.initialization import (
 )
 from suturetrack.kernels import search
 from suturetrack.nurbs import evaluate, length, reversed_curve, tangents
+from suturetrack.tracking.config import TrackingConfig
+from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import Neighbours, Strand
 from suturetrack.types import Float64, Nurbs, RidgeField, Seed
@@ -26,26 +29,70 @@ _LENGTH_TOLERANCE = 0.05
 _SHARED = 0.3
 
 
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What threads are looked for and followed with."""
+
+    rig: StereoRig
+    tracking: TrackingConfig
+    initialization: InitializationConfig
+
+    def look(self, field: RidgeField, seed: Seed) -> Initialization:
+        """The thread through the seed; raises as `initialize`."""
+        return initialize(field, self.rig, seed, self.initialization)
+
+    def follower(self, found: Initialization, field: RidgeField) -> Follower:
+        """Follows what was found in the field, on the rows where the right view showed it."""
+        rig = self.rig.with_row_offset(found.row_offset_px)
+        return Follower(found.curve, field, rig, self.tracking)
+
+
 def find_again(
     last: Nurbs,
     known_length: float | None,
-    seed: Seed,
+    starts: Iterable[Seed],
     field: RidgeField,
-    rig: StereoRig,
-    config: InitializationConfig,
+    setup: Setup,
+    *,
+    is_brief: bool = False,
 ) -> Initialization | None:
     """The thread in the field, run in the direction of the last curve; None where it is not found.
 
-    A curve counts as the thread if its length is the known one, or none is known.
+    A curve counts as the thread if its length is the known one, or none is known. A brief search
+    gives up with the first that does not.
     """
-    for start in (*_seeds_on(last, seed.thread, field, rig), seed):
+    for start in starts:
         try:
-            found = initialize(field, rig, start, config)
+            found = setup.look(field, start)
         except InitializationError:
             continue
         if has_length(found.curve, known_length):
             return replace(found, curve=directed(found.curve, last))
+        if is_brief:
+            break
     return None
+
+
+def starts_on(last: Nurbs, seed: Seed, field: RidgeField, rig: StereoRig) -> list[Seed]:
+    """Where the last curve still lies best on something that looks like thread, then the seed.
+
+    Args:
+        rig: with the rows on which the right view showed the last curve.
+    """
+    s = np.linspace(0.03, 0.97, _PLACES)
+    points = evaluate(last, s)
+    both = views(rig, points, tangents(last, s))
+    shown = np.minimum(
+        *(
+            search.responses(image, view.pixels, view.tangents)
+            for image, view in zip((field.left, field.right), both, strict=True)
+        )
+    )
+    best = np.argsort(-shown)
+    far = best[np.abs(best - best[0]) > _PLACES // 4]
+    chosen = [best[0], *far[: _SEEDS - 1]]
+    clear = points[chosen][shown[chosen] > 0]
+    return [*(Seed(seed.thread, point=(float(x), float(y), float(z))) for x, y, z in clear), seed]
 
 
 def has_length(curve: Nurbs, known_length: float | None) -> bool:
@@ -63,27 +110,6 @@ def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
         own = Strand(view.pixels, view.tangents, np.zeros(len(s)))
         alone |= ~search.doubled(own.arrays, strand.arrays, 0.0)
     return bool(np.mean(~alone) > _SHARED)
-
-
-def _seeds_on(last: Nurbs, thread: str, field: RidgeField, rig: StereoRig) -> list[Seed]:
-    """Where the last curve still lies best on something that looks like thread."""
-    s = np.linspace(0.03, 0.97, _PLACES)
-    points = evaluate(last, s)
-    both = views(rig, points, tangents(last, s))
-    shown = np.minimum(
-        *(
-            search.responses(image, view.pixels, view.tangents)
-            for image, view in zip((field.left, field.right), both, strict=True)
-        )
-    )
-    best = np.argsort(-shown)
-    far = best[np.abs(best - best[0]) > _PLACES // 4]
-    chosen = [best[0], *far[: _SEEDS - 1]]
-    return [
-        Seed(thread, point=(float(p[0]), float(p[1]), float(p[2])))
-        for p, clear in zip(points[chosen], shown[chosen] > 0, strict=True)
-        if clear
-    ]
 
 
 def directed(curve: Nurbs, last: Nurbs) -> Nurbs:

@@ -2,39 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
-import numpy as np
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import (
     Initialization,
     InitializationConfig,
     InitializationError,
-    initialize,
 )
-from suturetrack.nurbs import evaluate
 from suturetrack.tracking.clock import StreamClock
 from suturetrack.tracking.config import TrackingConfig
-from suturetrack.tracking.follower import Follower
-from suturetrack.tracking.recovery import directed, find_again, has_length, lies_on
-from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
+from suturetrack.tracking.looks import Look
+from suturetrack.tracking.recovery import Setup
+from suturetrack.tracking.searches import Closer, FromSeed
 from suturetrack.tracking.strands import NOBODY, Neighbours
-from suturetrack.types import Energies, Float64, Nurbs, RidgeField, Seed, Stamp, Status, ThreadState
+from suturetrack.tracking.thread import Thread, not_found
+from suturetrack.types import RidgeField, Seed, Status, ThreadState
 
 FORGOTTEN = "forgotten"
 """Event of the last state of a thread that was dropped."""
-# An attempt to find a thread again takes as long as many fields: so many are followed in between,
-# and more of them after so many attempts.
-_REST = 4
-_QUICK_ATTEMPTS = 6
-_RAREST = 3
-# A thread that was just found has no velocity yet: if it runs away it is found once more.
-_JUST_NS = 110_000_000
-# A first curve of less confidence is followed, but not called the thread until a later look is surer.
-_SURE = 0.5
-_BETWEEN_LOOKS_NS = 250_000_000
-_NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,40 +31,20 @@ class TrackerStep:
 
     states: tuple[ThreadState, ...]
     """One for each seeded thread, in the order of the seeds."""
-    initializations: dict[str, Initialization | InitializationError]
-    """By thread: what came of looking for it from its seed in this field."""
-
-
-@dataclass
-class _Thread:
-    seed: Seed
-    attempts: int
-    follower: Follower | None = None
-    last: ThreadState | None = None
-    toward: Nurbs | None = None
-    """Curve of the thread that had the name before."""
-    rest: int = 0
-    """Fields in which the lost thread is not looked for again."""
-    failures: int = 0
-    """How often it was looked for in vain."""
-    found: tuple[int, Nurbs] | None = None
-    """When it was last found by looking for it, and where."""
-    is_sure: bool = False
-    """Whether the curve that is followed may be called the thread."""
-    next_look_ns: int = 0
-    """When a doubtful thread is looked at again."""
-    looks: int = 0
-    """How often it was."""
-    was_sure: bool = False
-    """Whether it ever was, so that the thread's length is known."""
-    seeded_at: float = 0.5
-    """Parameter of the curve at the seed."""
-    rows: int = 0
-    """How much lower than the calibration says the right view shows the thread, px."""
+    initializations: dict[str, Initialization | InitializationError] = field(default_factory=dict)
+    """By thread: what came of looking for it from its seed."""
+    looked_in: dict[str, RidgeField] = field(default_factory=dict)
+    """By thread: the field of its initialization, which may be an earlier one."""
 
 
 class Tracker:
-    """Finds seeded threads and follows them from field to field."""
+    """Finds seeded threads and follows them from field to field.
+
+    While a thread is held, others are looked for beside the tracking, in a worker thread, one at a
+    time. What was begun with one field is taken up with the first that was captured 0.3 s later, so
+    that the same fields always give the same states. Fields that nobody may write to are kept for so
+    long, others copied.
+    """
 
     def __init__(
         self,
@@ -84,20 +52,23 @@ class Tracker:
         config: TrackingConfig = TrackingConfig(),
         initialization: InitializationConfig = InitializationConfig(),
     ) -> None:
-        self._rig, self._config, self._initialization = rig, config, initialization
-        self._threads: dict[str, _Thread] = {}
+        self._setup = Setup(rig, config, initialization)
+        self._threads: dict[str, Thread] = {}
         self._forgotten: list[str] = []
         self._clock = StreamClock()
+        self._worker = ThreadPoolExecutor(1, "look")
+        self._look: Look | None = None
 
     def seed(self, seed: Seed) -> None:
         """Looks for the thread from the next field on, for up to `config.patience` fields.
 
         A thread of the same name is looked for anew, and keeps its direction.
         """
-        before, thread = self._threads.get(seed.thread), _Thread(seed, self._config.patience)
-        if before is not None:
-            thread.toward = (before.last and before.last.curve) or before.toward
-        self._threads[seed.thread] = thread
+        before = self._threads.get(seed.thread)
+        toward = None if before is None else before.direction
+        patience = self._setup.tracking.patience
+        self._threads[seed.thread] = Thread(seed, self._setup, patience, toward=toward)
+        self._drop_look(seed.thread)
 
     def resume(self, seed: Seed, last: ThreadState) -> None:
         """Takes a thread up where another tracker left it, lost until it is found again.
@@ -110,7 +81,8 @@ class Tracker:
         some attempts in vain whatever its length is, for the last state may have been a bad one.
         """
         last = replace(last, status=Status.LOST, events=())
-        self._threads[seed.thread] = _Thread(seed, 0, None, last, was_sure=True)
+        self._threads[seed.thread] = Thread(seed, self._setup, 0, last=last)
+        self._drop_look(seed.thread)
 
     def forget(self, thread: str) -> bool:
         """Drops the thread; the next step tells so in a last state without a curve.
@@ -118,9 +90,14 @@ class Tracker:
         Returns whether there was such a thread.
         """
         known = self._threads.pop(thread, None) is not None
+        self._drop_look(thread)
         if known:
             self._forgotten.append(thread)
         return known
+
+    def is_sought(self, thread: str) -> bool:
+        """Whether the thread has been seeded, not been found yet, and not been given up."""
+        return thread in self._threads and self._threads[thread].is_sought
 
     def step(self, field: RidgeField) -> TrackerStep:
         """The seeded threads in the next field.
@@ -129,189 +106,68 @@ class Tracker:
         Dates may jump; time then goes on from where it was.
         """
         is_new = self._clock.advance(field.stamp)
-        dated = replace(field, stamp=replace(field.stamp, capture_ns=self._clock.now_ns))
-        initializations: dict[str, Initialization | InitializationError] = {}
-        states = [_not_found(name, field.stamp, (FORGOTTEN,)) for name in self._forgotten]
+        forgotten = [not_found(name, field.stamp, (FORGOTTEN,)) for name in self._forgotten]
         self._forgotten.clear()
-        for name, thread in self._threads.items():
-            if thread.follower is not None and thread.last is not None and not is_new:
-                state = replace(thread.last, events=("not newer than the last field",))
-            elif thread.follower is not None:
-                state = self._follow(name, thread, thread.follower, dated)
-            elif thread.last is not None and thread.last.curve is not None:
-                state = self._regain(name, thread, thread.last.curve, thread.last, dated)
-            else:
-                state = self._find(name, thread, dated, initializations)
-            thread.was_sure |= thread.is_sure
-            if state.status is Status.TRACKING and not thread.is_sure:
-                state = replace(state, status=Status.OCCLUDED)
-            thread.last = replace(state, stamp=field.stamp)
-            states.append(thread.last)
-        return TrackerStep(tuple(states), initializations)
-
-    def _follow(
-        self, name: str, thread: _Thread, follower: Follower, field: RidgeField
-    ) -> ThreadState:
-        if not thread.is_sure and self._look_closer(name, thread, follower, field):
-            assert thread.follower is not None
-            state = thread.follower.step(field, name, self._others(name, field))
-            return replace(state, events=("found for sure", *state.events))
-        state = follower.step(field, name, self._others(name, field))
-        was_lost = thread.last is not None and thread.last.status is Status.LOST
-        doubtful = follower.is_doubtful or self._just_found(thread, field)
-        if state.status is Status.OCCLUDED and doubtful:
-            last, length = follower.last_good, follower.known_length
-            again = self._look_again(name, thread, last, length, field, is_held=True)
-            return again or state
-        if state.status is not Status.LOST:
-            thread.rest = thread.failures = 0
-            return replace(state, events=("recovered", *state.events)) if was_lost else state
-        if not was_lost:
-            state = replace(state, events=("lost", *state.events))
-        again = self._look_again(name, thread, follower.last_good, follower.known_length, field)
-        return again or state
-
-    def _look_closer(
-        self, name: str, thread: _Thread, follower: Follower, field: RidgeField
-    ) -> bool:
-        """Whether a new look from where the seed was is sure; what it finds is followed then."""
-        if field.stamp.capture_ns < thread.next_look_ns:
-            return False
-        thread.next_look_ns = field.stamp.capture_ns + (_BETWEEN_LOOKS_NS << min(thread.looks, 4))
-        thread.looks += 1
-        curve = follower.model.curve
-        x, y, z = (float(c) for c in evaluate(curve, np.array([thread.seeded_at]))[0])
-        try:
-            found = initialize(field, self._rig, Seed(name, point=(x, y, z)), self._initialization)
-        except InitializationError:
-            return False
-        known_length = follower.known_length if thread.was_sure else None
-        thread.is_sure = (
-            found.confidence >= _SURE
-            and has_length(found.curve, known_length)
-            and not lies_on(found.curve, self._others(name, field), self._rig)
+        threads = self._threads.values()
+        done: list[Look] = []
+        if is_new:
+            dated = replace(field, stamp=replace(field.stamp, capture_ns=self._clock.now_ns))
+            held = {name for name, thread in self._threads.items() if thread.is_held}
+            for thread in threads:
+                thread.follow(dated, self._others(thread, dated))
+            done = [*self._go_on_looking(dated), *self._begin_to_look(dated, held)]
+        states = [thread.state_at(field.stamp, is_new) for thread in threads]
+        first = {look.thread: look for look in done if isinstance(look.search, FromSeed)}
+        return TrackerStep(
+            (*forgotten, *states),
+            {name: found for name, look in first.items() if (found := look.outcome().found)},
+            {name: look.field for name, look in first.items()},
         )
-        if thread.is_sure:
-            thread.rest = thread.failures = thread.looks = 0
-            thread.follower = self._follower(thread, directed(found.curve, curve), field)
-            if thread.was_sure:
-                thread.follower.remember(follower)
-        return thread.is_sure
 
-    def _regain(
-        self, name: str, thread: _Thread, curve: Nurbs, last: ThreadState, field: RidgeField
-    ) -> ThreadState:
-        known_length = last.length if thread.failures < _QUICK_ATTEMPTS else None
-        again = self._look_again(name, thread, curve, known_length, field)
-        return again or replace(last, stamp=field.stamp)
+    def _go_on_looking(self, field: RidgeField) -> Iterator[Look]:
+        """Hands the field to the look that is being made; gives it when it is due."""
+        look = self._look
+        if look is None:
+            return
+        thread = self._threads[look.thread]
+        look.add(self._worker, field, self._others(thread, field))
+        if field.stamp.capture_ns >= look.due_ns:
+            self._look = None
+            thread.take_up(look)
+            yield look
 
-    def _look_again(
-        self,
-        name: str,
-        thread: _Thread,
-        last: Nurbs,
-        known_length: float | None,
-        field: RidgeField,
-        *,
-        is_held: bool = False,
-    ) -> ThreadState | None:
-        """The state of a thread that is found again, every now and then looked for.
+    def _begin_to_look(self, field: RidgeField, held: set[str]) -> Iterator[Look]:
+        """Looks for threads, those first that have waited longest; gives looks that are over at once.
 
-        One that is held still gives way only to a curve that is sure.
+        Args:
+            held: the threads that were held before this field, which must not be held up.
         """
-        if thread.rest > 0 and not self._just_found(thread, field):
-            thread.rest -= 1
-            return None
-        thread.rest = _REST << min(max(thread.failures - _QUICK_ATTEMPTS, 0), _RAREST)
-        thread.failures += 1
-        found = find_again(last, known_length, thread.seed, field, self._rig, self._initialization)
-        others = self._others(name, field)
-        if found is None or lies_on(found.curve, others, self._rig):
-            return None
-        is_sure = found.confidence >= _SURE
-        if is_held and not is_sure:
-            return None
-        follower = self._follower(thread, found.curve, field)
-        if thread.follower is not None:
-            follower.remember(thread.follower)
-        state = follower.step(field, name, others)
-        if state.status is not Status.TRACKING:
-            return None
-        thread.follower, thread.is_sure, thread.looks = follower, is_sure, 0
-        self._take_velocity(thread, field)
-        return replace(state, events=("found again", *state.events))
-
-    def _just_found(self, thread: _Thread, field: RidgeField) -> bool:
-        return thread.found is not None and field.stamp.capture_ns - thread.found[0] < _JUST_NS
-
-    def _take_velocity(self, thread: _Thread, field: RidgeField) -> None:
-        """Where the thread was found twice in a row, the step between tells its velocity."""
-        assert thread.follower is not None
-        now, curve = field.stamp.capture_ns, thread.follower.model.curve
-        if thread.found is not None and self._just_found(thread, field):
-            before_ns, before = thread.found
-            thread.follower.came_from(before, (now - before_ns) * 1e-9)
-        thread.found = now, curve
-
-    def _follower(self, thread: _Thread, curve: Nurbs, field: RidgeField) -> Follower:
-        return Follower(curve, field, self._rig.with_row_offset(thread.rows), self._config)
-
-    def _others(self, name: str, field: RidgeField) -> Neighbours:
-        """The strands of the threads that are held, but for one."""
-        left, right = NOBODY
-        for other, thread in self._threads.items():
-            if other == name or thread.follower is None or thread.last is None:
+        for thread in sorted(self._threads.values(), key=lambda thread: thread.looked_ns):
+            if self._look is not None:
+                return
+            is_beside = bool(held - {thread.name})
+            search = thread.search(field.stamp.capture_ns, is_beside)
+            if search is None:
                 continue
-            if thread.last.status is not Status.LOST:
-                strands = thread.follower.strands(field.stamp.capture_ns)
-                left, right = left.joined(strands[0]), right.joined(strands[1])
+            look, others = Look(search, field), self._others(thread, field)
+            if is_beside or isinstance(search, Closer):
+                look.add(self._worker, field, others)
+                self._look = look
+            else:
+                look.at_once(others)
+                thread.take_up(look)
+                yield look
+
+    def _others(self, thread: Thread, field: RidgeField) -> Neighbours:
+        """The strands of the other threads that are held."""
+        left, right = NOBODY
+        for other in self._threads.values():
+            if other is thread or other.follower is None or not other.is_held:
+                continue
+            strands = other.follower.strands(field.stamp.capture_ns)
+            left, right = left.joined(strands[0]), right.joined(strands[1])
         return left, right
 
-    def _find(
-        self,
-        name: str,
-        thread: _Thread,
-        field: RidgeField,
-        initializations: dict[str, Initialization | InitializationError],
-    ) -> ThreadState:
-        if thread.attempts <= 0:
-            return _not_found(name, field.stamp, ())
-        thread.attempts -= 1
-        try:
-            found = initialize(field, self._rig, thread.seed, self._initialization)
-        except InitializationError as error:
-            initializations[name] = error
-            return _not_found(name, field.stamp, (f"not found: {error.reason}",))
-        if thread.toward is not None:
-            found = replace(found, curve=directed(found.curve, thread.toward))
-        initializations[name] = found
-        thread.rows = found.row_offset_px
-        thread.is_sure = found.confidence >= _SURE
-        thread.seeded_at = _nearest(found.curve, thread.seed, self._rig)
-        thread.next_look_ns = field.stamp.capture_ns + _BETWEEN_LOOKS_NS
-        thread.follower = self._follower(thread, found.curve, field)
-        state = thread.follower.step(field, name, self._others(name, field))
-        return replace(state, events=("found", *state.events))
-
-
-def _nearest(curve: Nurbs, seed: Seed, rig: StereoRig) -> float:
-    """Parameter of the curve's point that is nearest to the seed."""
-    s: Float64 = np.linspace(0, 1, 400)
-    points = evaluate(curve, s)
-    places = points if seed.pixel is None else rig.project_raw(points)[0]
-    wanted = np.array(seed.point if seed.pixel is None else seed.pixel)
-    return float(s[np.argmin(np.linalg.norm(places - wanted, axis=1))])
-
-
-def _not_found(name: str, stamp: Stamp, events: tuple[str, ...]) -> ThreadState:
-    return ThreadState(
-        stamp=stamp,
-        thread=name,
-        status=Status.LOST,
-        curve=None,
-        length=float("nan"),
-        energies=Energies(),
-        sigma=_NOWHERE,
-        seen=np.zeros(RELIABILITY_SAMPLES, bool),
-        events=events,
-    )
+    def _drop_look(self, thread: str) -> None:
+        if self._look is not None and self._look.thread == thread:
+            self._look = None

@@ -1,0 +1,93 @@
+"""How sure it is that the curve that is followed is the thread, as looks add up."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.metrics import resample
+from suturetrack.nurbs import evaluate
+from suturetrack.types import Float64, Nurbs
+
+SURE = 0.5
+"""Confidence of a single look from which its curve may be called the thread."""
+# Votes for a curve that make it sure, in those of a look that is just sure by itself.
+_ENOUGH = 1.5
+# Two looks see the same if they are nowhere further apart, and another thing if they are somewhere.
+_SAME_PX, _OTHER_PX = 5.0, 15.0
+# How much the thread has to bend between two looks that both count.
+_BENT_PX = 2.0
+_PLACES = 64
+# The pause after the first look. It doubles after every few looks, so often at most where the thread
+# moves and at rest.
+_PAUSE_NS = 250_000_000
+_FEW = 4
+_MOVING, _RESTING = 2, 4
+
+
+class Sureness:
+    """What the looks at a thread say together.
+
+    A look votes for the curve that is followed if it finds the same one, from end to end in the same
+    order, and against it if it finds another; the square of its confidence is its weight. What is
+    voted down gives way to what the last look found. A look at the same picture says nothing new: it
+    counts only if the thread has bent since the last one that did, or if it is sure by itself.
+
+    Args:
+        confidence: of the look that found the curve.
+        curve: what it found.
+        now_ns: capture time of the field.
+        rig: the cameras.
+    """
+
+    def __init__(self, confidence: float, curve: Nurbs, now_ns: int, rig: StereoRig) -> None:
+        self.is_sure = confidence >= SURE
+        """Whether the curve that is followed may be called the thread."""
+        self._rig, self._votes = rig, _votes(confidence)
+        self._shape = self._outline(curve)
+        self._looks, self._last_ns = 0, now_ns
+
+    def asks_for_look(self, curve: Nurbs, now_ns: int) -> bool:
+        """Whether it is time to look again at what is followed."""
+        passed, doublings = now_ns - self._last_ns, -(-self._looks // _FEW)
+        if self.is_sure or passed < _PAUSE_NS << min(doublings, _MOVING):
+            return False
+        if passed < _PAUSE_NS << min(doublings, _RESTING) and not self._has_bent(curve):
+            return False
+        self._looks, self._last_ns = self._looks + 1, now_ns
+        return True
+
+    def weigh(self, confidence: float, found: Nurbs, followed: Nurbs) -> bool:
+        """Adds a look; whether what it found, in the direction of what is followed, takes its place."""
+        places = self._outline(found), self._outline(followed)
+        apart = float(np.linalg.norm(places[0] - places[1], axis=2).max())
+        if confidence >= SURE and apart < _OTHER_PX:
+            self.is_sure = True
+            return apart >= _SAME_PX
+        if (confidence < SURE and not self._has_bent(followed)) or _SAME_PX <= apart < _OTHER_PX:
+            return False
+        agrees = apart < _SAME_PX
+        self._votes += _votes(confidence) if agrees else -_votes(confidence)
+        self.is_sure = agrees and self._votes >= _ENOUGH
+        is_outvoted = self._votes < 0
+        self._votes, self._shape = abs(self._votes), places[0 if is_outvoted else 1]
+        return is_outvoted
+
+    def _has_bent(self, curve: Nurbs) -> bool:
+        """Whether its left image is no more the one that counted last, moved, turned and enlarged."""
+        now, before = (
+            p - p.mean()
+            for p in (view[0] @ [1, 1j] for view in (self._outline(curve), self._shape))
+        )
+        along = abs(np.vdot(before, now)) ** 2 / np.vdot(before, before).real
+        rest = np.vdot(now, now).real - along
+        return bool(rest >= len(now) * _BENT_PX**2)
+
+    def _outline(self, curve: Nurbs) -> Float64:
+        """(2, k, 2) px, evenly spaced along the left and along the right image of the curve."""
+        s: Float64 = np.linspace(0, 1, 8 * _PLACES)
+        return np.stack([resample(view, _PLACES) for view in self._rig.project(evaluate(curve, s))])
+
+
+def _votes(confidence: float) -> float:
+    return (confidence / SURE) ** 2

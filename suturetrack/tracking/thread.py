@@ -1,0 +1,240 @@
+"""One seeded thread: looked for, followed, looked at again."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.initialization import Initialization, InitializationError
+from suturetrack.nurbs import evaluate
+from suturetrack.tracking.follower import Follower
+from suturetrack.tracking.looks import Look, Outcome
+from suturetrack.tracking.pursuit import Pursuit
+from suturetrack.tracking.recovery import Setup
+from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
+from suturetrack.tracking.searches import Again, Closer, FromSeed, Search
+from suturetrack.tracking.strands import Neighbours
+from suturetrack.tracking.sureness import SURE, Sureness
+from suturetrack.types import Energies, Float64, Nurbs, RidgeField, Seed, Stamp, Status, ThreadState
+
+# An attempt to find a thread again takes as long as many fields: so many are followed in between,
+# and more of them after so many attempts.
+_REST = 4
+_QUICK_ATTEMPTS = 6
+_RAREST = 3
+_NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
+
+
+class Thread:
+    """What is known of one seeded thread.
+
+    Args:
+        patience: fields in which it is looked for from its seed.
+        toward: a curve that tells its direction.
+        last: where another tracker left it; lost.
+    """
+
+    def __init__(
+        self,
+        seed: Seed,
+        setup: Setup,
+        patience: int,
+        *,
+        toward: Nurbs | None = None,
+        last: ThreadState | None = None,
+    ) -> None:
+        self.name, self.looked_ns = seed.thread, -1
+        self._seed, self._setup, self._patience, self._toward = seed, setup, patience, toward
+        self._state = self._followed = last or not_found(seed.thread, Stamp(0, 0, 0), ())
+        self._pursuit: Pursuit | None = None
+        self._sureness: Sureness | None = None
+        self._was_sure = last is not None
+        self._seeded_at = 0.5
+        self._rest = self._failures = 0
+
+    @property
+    def is_held(self) -> bool:
+        """Whether there is a curve that is not lost."""
+        return self._state.status is not Status.LOST
+
+    @property
+    def is_sought(self) -> bool:
+        """Whether it has not been found from its seed yet, nor been given up."""
+        return self._state.curve is None and self._patience > 0
+
+    @property
+    def follower(self) -> Follower | None:
+        """Who follows the thread, once it has been found."""
+        return None if self._pursuit is None else self._pursuit.follower
+
+    @property
+    def direction(self) -> Nurbs | None:
+        """A curve that runs as the thread does."""
+        return self._state.curve or self._toward
+
+    def state_at(self, stamp: Stamp, is_new: bool) -> ThreadState:
+        """What has become of the thread."""
+        events = self._state.events if is_new else ("not newer than the last field",)
+        return replace(self._state, stamp=stamp, events=events)
+
+    def follow(self, field: RidgeField, others: Neighbours) -> None:
+        """Goes on to the next field, as far as the thread can be followed."""
+        was_lost = not self.is_held
+        if self._pursuit is None:
+            self._state = replace(self._state, events=())
+            return
+        state = self._pursuit.step(field, others)
+        if state.status is not Status.LOST and was_lost:
+            state = replace(state, events=("recovered", *state.events))
+        elif state.status is Status.LOST and not was_lost:
+            state = replace(state, events=("lost", *state.events))
+        self._come_to(state)
+        if self.is_held and not self._is_uncertain:
+            self._rest = self._failures = 0
+
+    def _come_to(self, state: ThreadState) -> None:
+        """What is not sure to be the thread is not called so."""
+        self._followed = state
+        is_sure = self._sureness is not None and self._sureness.is_sure
+        self._was_sure |= is_sure
+        if state.status is Status.TRACKING and not is_sure:
+            state = replace(state, status=Status.OCCLUDED)
+        self._state = state
+
+    def search(self, now_ns: int, is_beside: bool) -> Search | None:
+        """How the thread is to be looked for now; None for not at all.
+
+        Args:
+            is_beside: whether others are tracked beside, so that it should not take long.
+        """
+        if self._state.curve is None:
+            search = self._search_from_seed()
+        elif not self.is_held or self._is_uncertain:
+            search = self._search_again(is_beside)
+        else:
+            search = self._search_closer(now_ns)
+        self.looked_ns = now_ns if search else self.looked_ns
+        return search
+
+    def _search_from_seed(self) -> Search | None:
+        if self._patience <= 0:
+            return None
+        self._patience -= 1
+        return FromSeed(self._seed, self._setup, self._toward)
+
+    def _search_again(self, is_beside: bool) -> Search | None:
+        if self._rest > 0:
+            self._rest -= 1
+            return None
+        self._rest = _REST << min(max(self._failures - _QUICK_ATTEMPTS, 0), _RAREST)
+        self._failures += 1
+        turn = self._failures - 1 if is_beside else None
+        follower = copy.copy(self.follower)
+        if follower is not None:
+            last, known_length, rig = follower.last_good, follower.known_length, follower.rig
+            return Again(self._seed, self._setup, last, known_length, rig, follower, turn)
+        assert self._state.curve is not None
+        length = self._state.length if self._failures <= _QUICK_ATTEMPTS else None
+        return Again(
+            self._seed, self._setup, self._state.curve, length, self._setup.rig, None, turn
+        )
+
+    def _search_closer(self, now_ns: int) -> Search | None:
+        assert self.follower is not None
+        assert self._sureness is not None
+        curve = self.follower.model.curve
+        if not self._sureness.asks_for_look(curve, now_ns):
+            return None
+        x, y, z = (float(c) for c in evaluate(curve, np.array([self._seeded_at]))[0])
+        before = copy.copy(self.follower) if self._was_sure else None
+        return Closer(Seed(self.name, point=(x, y, z)), self._setup, curve, before)
+
+    def take_up(self, look: Look) -> None:
+        """Goes on with what a look found, if that is worth more."""
+        self._rest = max(self._rest - look.fields + 1, 0)
+        outcome, search = look.outcome(), look.search
+        if isinstance(search, FromSeed):
+            self._take_first(outcome, look.fields)
+        elif outcome.state is None or outcome.state.status is Status.LOST:
+            return
+        elif isinstance(search, Again):
+            self._take_again(outcome)
+        else:
+            self._take_closer(search, outcome)
+
+    def _take_first(self, outcome: Outcome, fields: int) -> None:
+        if isinstance(outcome.found, InitializationError):
+            # The first field was counted, and the last one is the first of the next look.
+            self._patience -= max(fields - 2, 0)
+            self._state = replace(self._state, events=(f"not found: {outcome.found.reason}",))
+            return
+        assert outcome.found is not None
+        self._seeded_at = _nearest(outcome.found.curve, self._seed, self._setup.rig)
+        self._hold(outcome, "found")
+
+    def _take_again(self, outcome: Outcome) -> None:
+        """A thread that is held still gives way only to a curve that is sure."""
+        assert outcome.pursuit is not None
+        assert outcome.state is not None
+        is_sure = outcome.pursuit.confidence >= SURE
+        is_worse = self._state.status is not Status.TRACKING and (is_sure or not self.is_held)
+        if is_worse and outcome.state.status is Status.TRACKING:
+            self._hold(outcome, "found again")
+
+    def _take_closer(self, search: Closer, outcome: Outcome) -> None:
+        assert isinstance(outcome.found, Initialization)
+        assert self._sureness is not None
+        found = outcome.found
+        if self._sureness.weigh(found.confidence, found.curve, search.followed):
+            self._seeded_at = _nearest(found.curve, search.seed, self._setup.rig)
+            event = "found for sure" if self._sureness.is_sure else "found elsewhere"
+            self._hold(outcome, event, self._sureness)
+        elif self._sureness.is_sure:
+            self._come_to(
+                replace(self._followed, events=("found for sure", *self._followed.events))
+            )
+
+    def _hold(self, outcome: Outcome, event: str, sureness: Sureness | None = None) -> None:
+        assert outcome.pursuit is not None
+        assert outcome.state is not None
+        self._pursuit, state = outcome.pursuit, outcome.state
+        self._sureness = sureness or Sureness(
+            outcome.pursuit.confidence,
+            outcome.pursuit.follower.model.curve,
+            state.stamp.capture_ns,
+            self._setup.rig,
+        )
+        self._rest = self._failures = 0
+        self._come_to(replace(state, events=(event, *state.events)))
+
+    @property
+    def _is_uncertain(self) -> bool:
+        is_doubtful = self.follower is not None and self.follower.is_doubtful
+        return self._state.status is Status.OCCLUDED and is_doubtful
+
+
+def _nearest(curve: Nurbs, seed: Seed, rig: StereoRig) -> float:
+    """Parameter of the curve's point that is nearest to the seed."""
+    s: Float64 = np.linspace(0, 1, 400)
+    points = evaluate(curve, s)
+    places = points if seed.pixel is None else rig.project_raw(points)[0]
+    wanted = np.array(seed.point if seed.pixel is None else seed.pixel)
+    return float(s[np.argmin(np.linalg.norm(places - wanted, axis=1))])
+
+
+def not_found(name: str, stamp: Stamp, events: tuple[str, ...]) -> ThreadState:
+    """The state of a thread that has no curve."""
+    return ThreadState(
+        stamp=stamp,
+        thread=name,
+        status=Status.LOST,
+        curve=None,
+        length=float("nan"),
+        energies=Energies(),
+        sigma=_NOWHERE,
+        seen=np.zeros(RELIABILITY_SAMPLES, bool),
+        events=events,
+    )

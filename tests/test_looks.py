@@ -1,0 +1,236 @@
+"""Looks at threads beside the tracking, and what they say together."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from suturetrack import metrics, nurbs
+from suturetrack.camera import StereoRig
+from suturetrack.initialization import Initialization, initialize
+from suturetrack.tracking import Tracker
+from suturetrack.types import RidgeField, Seed, Status, ThreadState
+from tests.painting import FPS, paint, thread
+
+Look = Callable[..., Initialization]
+DELAY = round(0.3 * FPS)
+
+
+def seed_on(rig: StereoRig, points: np.ndarray, name: str = "0") -> Seed:
+    u, v = rig.project_raw(points[len(points) // 2])[0]
+    return Seed(name, pixel=(float(u), float(v)))
+
+
+def rms(state: ThreadState, truth: np.ndarray) -> float:
+    assert state.curve is not None
+    return metrics.curve_error(nurbs.evaluate(state.curve, np.linspace(0, 1, 500)), truth).rms
+
+
+def pair(frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two threads side by side."""
+    time = frame / FPS
+    other = thread(1 + time, 80.0, 210.0, -0.6) + np.array([0, 14, 0])
+    return thread(time) - [0, 8, 0], other
+
+
+def fields_of(rig: StereoRig, count: int, away: range) -> list[RidgeField]:
+    """Both threads, the second of them away for a while."""
+    pairs = [pair(i) for i in range(count)]
+    return [paint(rig, both[:1] if i in away else both, i) for i, both in enumerate(pairs)]
+
+
+def looks_by(monkeypatch: pytest.MonkeyPatch, look: Look) -> None:
+    monkeypatch.setattr("suturetrack.tracking.recovery.initialize", look)
+
+
+def tracker_of(rig: StereoRig) -> Tracker:
+    tracker = Tracker(rig)
+    for name, points in zip("ab", pair(0), strict=True):
+        tracker.seed(seed_on(rig, points, name))
+    return tracker
+
+
+def test_a_look_for_one_thread_holds_no_other_up(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fields = fields_of(rig, 50, range(4, 20))
+    tracker = tracker_of(rig)
+    states = [tracker.step(field).states for field in fields[:4]]
+    assert [state.status for state in states[-1]] == [Status.TRACKING] * 2
+    began, may_end, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def slow(*args: object) -> Initialization:
+        began.set()
+        assert may_end.wait(30)
+        ended.set()
+        return initialize(*args)  # type: ignore[arg-type]
+
+    looks_by(monkeypatch, slow)
+    beside = 0
+    for field in fields[4:]:
+        states.append(tracker.step(field).states)
+        if began.is_set() and not may_end.is_set():
+            assert not ended.is_set()
+            assert states[-1][0].status is Status.TRACKING
+            assert rms(states[-1][0], pair(field.stamp.frame)[0]) < 0.15
+            beside += 1
+        if beside == DELAY - 2:
+            may_end.set()
+    assert ended.is_set()
+    assert all(a.status is Status.TRACKING for a, _ in states)
+    assert any(b.status is Status.LOST for _, b in states)
+    assert states[-1][1].status is Status.TRACKING
+    for state, truth in zip(states[-1], pair(49), strict=True):
+        assert rms(state, truth) < 0.15
+
+
+def test_when_a_look_is_done_makes_no_difference(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fields = fields_of(rig, 60, range(4, 16))
+    # Through the seed, but turned around it, so that it has to be looked for.
+    seeded = pair(0)[1][300]
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    back = [seeded + (pair(i)[1] - pair(i)[1][300]) @ turn for i in range(60)]
+    fields[16:] = [paint(rig, [pair(i)[0], back[i]], i) for i in range(16, 60)]
+    runs = []
+    for slowness_s in (0.0, 0.03):
+
+        def look(*args: object, slowness_s: float = slowness_s) -> Initialization:
+            time.sleep(slowness_s)
+            return initialize(*args)  # type: ignore[arg-type]
+
+        looks_by(monkeypatch, look)
+        tracker = tracker_of(rig)
+        runs.append([state for field in fields for state in tracker.step(field).states])
+    assert any("found again" in state.events for state in runs[0])
+    assert runs[0][-1].status is Status.TRACKING
+    assert rms(runs[0][-1], back[-1]) < 0.15
+    for one, other in zip(*runs, strict=True):
+        assert (one.status, one.events, one.length) == (other.status, other.events, other.length)
+        assert one.curve is not None
+        assert other.curve is not None
+        np.testing.assert_array_equal(one.curve.control_points, other.curve.control_points)
+
+
+def test_buffers_may_be_used_again_while_a_look_goes_on(rig: StereoRig) -> None:
+    fields = fields_of(rig, 12 + DELAY, range(0))
+    results = []
+    for is_reused in (False, True):
+        tracker = Tracker(rig)
+        tracker.seed(seed_on(rig, pair(0)[0], "a"))
+        buffers = [np.empty_like(fields[0].left), np.empty_like(fields[0].right)]
+        for i, field in enumerate(fields):
+            if i == 2:
+                tracker.seed(seed_on(rig, pair(2)[1], "b"))
+            if is_reused:
+                buffers[0][:], buffers[1][:] = field.left, field.right
+                field = replace(field, left=buffers[0], right=buffers[1])
+            step = tracker.step(field)
+        results.append(step.states[1].curve)
+    assert results[0] is not None
+    assert results[1] is not None
+    np.testing.assert_array_equal(results[0].control_points, results[1].control_points)
+
+
+def test_a_thread_that_is_seeded_beside_another_comes_to_the_present(rig: StereoRig) -> None:
+    fields = fields_of(rig, 30, range(0))
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, pair(0)[0], "a"))
+    steps = []
+    for i, field in enumerate(fields):
+        if i == 5:
+            tracker.seed(seed_on(rig, pair(5)[1], "b"))
+            assert tracker.is_sought("b")
+        steps.append(tracker.step(field))
+    (found,) = [i for i, step in enumerate(steps) if "b" in step.initializations]
+    assert found == 5 + DELAY
+    assert steps[found].looked_in["b"].stamp == fields[5].stamp
+    first = steps[found].initializations["b"]
+    assert isinstance(first, Initialization)
+    places = nurbs.evaluate(first.curve, np.linspace(0, 1, 500))
+    assert metrics.curve_error(places, pair(5)[1]).rms < 0.15
+    assert rms(steps[found].states[1], pair(found)[1]) < 0.15
+    assert steps[found].states[1].events[0] == "found"
+    assert not tracker.is_sought("b")
+    assert all(step.states[0].status is Status.TRACKING for step in steps)
+
+
+def test_patience_ends_beside_another_thread_as_well(rig: StereoRig) -> None:
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, pair(0)[0], "a"))
+    fields = fields_of(rig, 50, range(50))
+    tracker.step(fields[0])
+    tracker.seed(seed_on(rig, pair(0)[1], "b"))
+    errors = [i for i, field in enumerate(fields[1:]) if "b" in tracker.step(field).initializations]
+    assert errors == [DELAY, 2 * DELAY, 3 * DELAY, 4 * DELAY][: len(errors)]
+    assert 30 <= errors[-1] < 30 + DELAY
+    assert not tracker.is_sought("b")
+
+
+def follow(rig: StereoRig, truths: Sequence[np.ndarray]) -> list[ThreadState]:
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, truths[0]))
+    return [tracker.step(paint(rig, [points], i)).states[0] for i, points in enumerate(truths)]
+
+
+def test_looks_at_a_thread_that_bends_add_up(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def doubtful(*args: object) -> Initialization:
+        return replace(initialize(*args), confidence=0.4)  # type: ignore[arg-type]
+
+    looks_by(monkeypatch, doubtful)
+    truths = [thread(i / FPS) for i in range(3 * FPS)]
+    states = follow(rig, truths)
+    sure = next(i for i, state in enumerate(states) if "found for sure" in state.events)
+    assert sure > 2 * DELAY
+    assert all(state.status is Status.OCCLUDED for state in states[:sure])
+    assert all(state.status is Status.TRACKING for state in states[sure:])
+    assert rms(states[-1], truths[-1]) < 0.1
+    at_rest = follow(rig, [truths[0]] * len(truths))
+    assert all(state.status is Status.OCCLUDED for state in at_rest)
+    assert rms(at_rest[-1], truths[0]) < 0.1
+
+
+def looks_at(*threads: int) -> Look:
+    """Doubtful looks at one or the other of a pair, in turn; the last ones all at the last."""
+    looks: list[int] = []
+
+    def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
+        looks.append(threads[min(len(looks), len(threads) - 1)])
+        seed = seed_on(rig, pair(field.stamp.frame)[looks[-1]])
+        return replace(initialize(field, rig, seed), confidence=0.45)
+
+    return look
+
+
+def test_looks_that_contradict_one_another_do_not_add_up(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks_by(monkeypatch, looks_at(*[0, 1] * 20))
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, pair(0)[0]))
+    states = [tracker.step(field).states[0] for field in fields_of(rig, 4 * FPS, range(0))]
+    assert all(state.status is Status.OCCLUDED for state in states)
+
+
+def test_what_most_looks_find_takes_the_place_of_the_first(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks_by(monkeypatch, looks_at(0, 1))
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, pair(0)[0]))
+    states = [tracker.step(field).states[0] for field in fields_of(rig, 4 * FPS, range(0))]
+    assert rms(states[0], pair(0)[0]) < 0.15
+    elsewhere = next(i for i, state in enumerate(states) if "found elsewhere" in state.events)
+    sure = next(i for i, state in enumerate(states) if "found for sure" in state.events)
+    assert elsewhere < sure
+    assert all(state.status is Status.OCCLUDED for state in states[:sure])
+    assert all(state.status is Status.TRACKING for state in states[sure:])
+    assert max(rms(state, pair(i)[1]) for i, state in enumerate(states) if i >= sure) < 0.25
