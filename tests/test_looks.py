@@ -13,6 +13,7 @@ import pytest
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, initialize
+from suturetrack.initialization.matching import raised
 from suturetrack.tracking import Tracker
 from suturetrack.types import RidgeField, Seed, Status, ThreadState
 from tests.painting import FPS, paint, thread
@@ -36,6 +37,12 @@ def pair(frame: int) -> tuple[np.ndarray, np.ndarray]:
     time = frame / FPS
     other = thread(1 + time, 80.0, 210.0, -0.6) + np.array([0, 14, 0])
     return thread(time) - [0, 8, 0], other
+
+
+def turned(points: np.ndarray) -> np.ndarray:
+    """The second thread through its seed still, but turned around it, so that it has to be looked for."""
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(pair(0)[1][300] + (points - points[300]) @ turn)
 
 
 def fields_of(rig: StereoRig, count: int, away: range) -> list[RidgeField]:
@@ -93,10 +100,7 @@ def test_when_a_look_is_done_makes_no_difference(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fields = fields_of(rig, 60, range(4, 16))
-    # Through the seed, but turned around it, so that it has to be looked for.
-    seeded = pair(0)[1][300]
-    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    back = [seeded + (pair(i)[1] - pair(i)[1][300]) @ turn for i in range(60)]
+    back = [turned(pair(i)[1]) for i in range(60)]
     fields[16:] = [paint(rig, [pair(i)[0], back[i]], i) for i in range(16, 60)]
     runs = []
     for slowness_s in (0.0, 0.03):
@@ -171,6 +175,27 @@ def test_patience_ends_beside_another_thread_as_well(rig: StereoRig) -> None:
     assert errors == [DELAY, 2 * DELAY, 3 * DELAY, 4 * DELAY][: len(errors)]
     assert 30 <= errors[-1] < 30 + DELAY
     assert not tracker.is_sought("b")
+
+
+def test_what_is_found_again_is_followed_on_the_rows_that_show_it(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lowered = rig.with_row_offset(4)
+
+    def look(field: RidgeField, rig: StereoRig, seed: Seed, config: object) -> Initialization:
+        level = replace(field, right=raised(field.right, 4))
+        return replace(initialize(level, rig, seed), row_offset_px=4)
+
+    looks_by(monkeypatch, look)
+    points, seed = pair(0)[0], seed_on(rig, pair(0)[0])
+    before, after = Tracker(rig), Tracker(rig)
+    before.seed(seed)
+    (last,) = before.step(paint(lowered, [points], 0)).states
+    after.resume(seed, last)
+    states = [after.step(paint(lowered, [points], i)).states[0] for i in range(1, 8)]
+    assert "found again" in states[0].events
+    assert all(state.status is Status.TRACKING for state in states)
+    assert rms(states[-1], points) < 0.1
 
 
 def follow(rig: StereoRig, truths: Sequence[np.ndarray]) -> list[ThreadState]:
