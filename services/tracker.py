@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -22,6 +23,9 @@ from suturetrack.initialization import Initialization, InitializationConfig, Ini
 from suturetrack.tracking import Tracker, TrackerStep, TrackingConfig
 from suturetrack.types import RidgeField, Seed, Stamp
 
+# A look in the worker thread must give way to the threads that are held at once.
+_SWITCH_INTERVAL_S = 5e-4
+
 
 @dataclass(frozen=True)
 class TrackerConfig:
@@ -37,6 +41,7 @@ class TrackerConfig:
 
 def run(service: Service, config: TrackerConfig) -> None:
     """Tracks on the newest field, again and again; raises InputError for a seed on no thread."""
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     bus = service.bus
     rig = service.calibrated_rig()
     tracker = Tracker(rig, config.tracking, config.initialization)
