@@ -135,9 +135,11 @@ def test_strands_are_kept_apart_as_their_twins_do(seed: int) -> None:
             search.claimed(own, other, offsets, apart),
             strands_reference.claimed(own, other, offsets, apart),
         )
-        np.testing.assert_array_equal(
-            search.doubled(own, other, apart), strands_reference.doubled(own, other, apart)
-        )
+        for near in (2.0, 5.5):
+            np.testing.assert_array_equal(
+                search.doubled(own, other, apart, near),
+                strands_reference.doubled(own, other, apart, near),
+            )
     np.testing.assert_array_equal(
         search.covered(own[0], own[1], offsets, other[0], 3.0),
         strands_reference.covered(own[0], own[1], offsets, other[0], 3.0),
@@ -153,5 +155,6 @@ def test_a_place_belongs_to_the_strand_that_is_nearest() -> None:
     taken = search.claimed(own, beside, offsets, 45.0)[20]
     assert offsets[taken].tolist() == [4.0, 5.0, 6.0, 7.0, 8.0]
     assert not search.doubled(own, beside, 45.0).any()
+    assert search.doubled(own, beside, 45.0, 6.5).all()
     assert search.doubled(own, (own[0], east, np.full(40, np.inf)), 45.0).all()
     assert not search.doubled(own, own, 45.0).any()

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -48,6 +50,18 @@ def test_ends_are_found_without_bias_in_what_the_filter_shows() -> None:
             offsets.append(found.offset_px)
     assert np.abs(offsets).max() < 1.0
     assert abs(np.mean(offsets)) < 0.2
+
+
+def test_an_end_beside_another_ridge_only_makes_good_what_is_lacking() -> None:
+    watch, now = settled_watch(100.0)
+    beside = replace(step_at(8.0), alone=False)
+    assert watch.moves(step_at(0.0), beside, 100.0, now + FRAME_NS) == (0.0, 0.0)
+    assert watch.seen == (True, False)
+    start, stop = watch.moves(step_at(0.0), beside, 99.0, now + 2 * FRAME_NS)
+    assert start == 0.0
+    assert stop == pytest.approx(100 / 99 - 1)
+    _, stop = watch.moves(step_at(0.0), beside, 90.0, now + 3 * FRAME_NS)
+    assert stop == pytest.approx(8 * PIXEL)
 
 
 def test_a_loop_that_is_drawn_shut_moves_no_end() -> None:

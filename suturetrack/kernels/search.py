@@ -201,19 +201,24 @@ def doubled(
     strand: tuple[Float64, Float64, Float64],
     others: tuple[Float64, Float64, Float64],
     apart: float,
+    near: float = _APART_PX,
 ) -> Bool:
-    """(k,) samples of a strand that lie on another one; the arguments are those of `claimed`."""
+    """(k,) samples of a strand that lie on another one, less than `near` px beside it.
+
+    The other arguments are those of `claimed`.
+    """
     pixels, tangents, along = strand
     other_pixels, other_tangents, other_along = others
     out = np.zeros(len(pixels), np.bool_)
+    far = max(near, _CLAIM_PX)
     for j in range(len(pixels)):
         for q in range(len(other_pixels)):
             du, dv = other_pixels[q, 0] - pixels[j, 0], other_pixels[q, 1] - pixels[j, 1]
-            if abs(du) > _CLAIM_PX or abs(dv) > _CLAIM_PX or abs(other_along[q] - along[j]) < apart:
+            if abs(du) > far or abs(dv) > far or abs(other_along[q] - along[j]) < apart:
                 continue
             tu, tv = tangents[j, 0], tangents[j, 1]
             parallel = abs(tu * other_tangents[q, 0] + tv * other_tangents[q, 1])
-            if abs(dv * tu - du * tv) < _APART_PX and parallel > _PARALLEL:
+            if abs(dv * tu - du * tv) < near and parallel > _PARALLEL:
                 out[j] = True
                 break
     return out

@@ -35,6 +35,8 @@ class EndStep:
     """Length of a pixel there, as a part of the curve's length."""
     at_border: bool
     """Whether the image's border cuts the thread."""
+    alone: bool = True
+    """Whether no other ridge runs beside the end, which it could run on along."""
 
     @property
     def offset(self) -> float:
@@ -148,7 +150,7 @@ class EndWatch:
     What one end loses and the other gains is the thread sliding along itself. A thread that is
     suddenly shorter at an end is hidden there, one that is suddenly longer than it ever was has met
     something that looks like it: its length is then held for a while, the more firmly the longer it
-    was steady.
+    was steady. An end beside which another ridge runs only makes good what is lacking.
     """
 
     def __init__(self, length: float, now_ns: int) -> None:
@@ -177,7 +179,9 @@ class EndWatch:
         for end in doubted:
             lacking = self.length / length - 1.0 - offsets[1 - end]
             step = steps[end]
-            if step is None or len(doubted) == 2:
+            if step is not None and not step.alone:
+                offsets[end] = min(max(step.offset, 0.0), max(lacking, 0.0))
+            elif step is None or len(doubted) == 2:
                 offsets[end] = 0.0
             else:
                 bound = _DRAWN_PX * step.pixel
@@ -200,7 +204,7 @@ class EndWatch:
         now_ns: int,
     ) -> list[int]:
         """The ends whose steps do not count."""
-        doubted = [end for end in (0, 1) if steps[end] is None]
+        doubted = [end for end, step in enumerate(steps) if step is None or not step.alone]
         shown = [step for step in steps if step]
         if doubted or any(step.at_border for step in shown):
             return doubted

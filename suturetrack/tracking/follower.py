@@ -37,10 +37,12 @@ _WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
 _ENOUGH, _GAIN = 0.97, 0.02
 _DROP = 0.01
 _RETRY = 5
-# A thread found again has the length that it had, to this part.
-_LENGTH_TOLERANCE = 0.05
+# A thread found again has the length that it had, to this part; to the other one if it is not alone.
+_LENGTH_TOLERANCE, _CROWDED_TOLERANCE = 0.05, 0.01
 # A thread of which something is hidden has not grown by more.
 _GROWTH = 0.02
+# A thread that is not alone is not longer by more.
+_DETOUR = 0.005
 _NOISE_SIGMAS = 3.0
 _LEAST_LEFT = 0.65
 _ALL = 0.97
@@ -52,6 +54,8 @@ _SOME = 0.2
 _FORGOTTEN_S = 3.0
 # Places on a thread that keep other threads away.
 _CLAIMS = 160
+# Samples at an end that tell whether another ridge runs beside it.
+_TIP = 3
 
 
 @dataclass
@@ -128,8 +132,9 @@ class Follower:
         predicted = model.motion.predict(before, seconds)
         self._doubt.grow(before, predicted, model.curve, seen, self.rig)
         if self.config.method != "paper":
+            told = seen & evidence.alone
             model.motion = model.motion.learn(
-                before, model.curve, seen, model.ends.seen, self.rig, seconds
+                before, model.curve, told, model.ends.seen, self.rig, seconds
             )
         if evidence.share >= 0.5:
             model.seen_ns = model.capture_ns
@@ -152,8 +157,24 @@ class Follower:
         ends = self.model.ends
         length = length_of(self.model.curve) if plain.mean() > _ALL else ends.wanted
         self._established |= ends.settled
-        noise = _NOISE_SIGMAS * float(np.median(evidence.evenly()[0]))
-        return self._established and length > (1 + _GROWTH) * self.known_length + noise
+        return self._established and length > (1 + _GROWTH) * self.known_length + _noise(evidence)
+
+    def _makes_detour(self, plain: Bool, evidence: Evidence) -> bool:
+        """Whether the curve is longer than the thread and not alone all along.
+
+        Where other ridges draw it aside, most of all in depth, they make it longer.
+        """
+        longest = (1 + _DETOUR) * self.known_length + _noise(evidence)
+        is_clear = (plain & evidence.alone).mean() > _ALL
+        return self._established and not is_clear and length_of(self.model.curve) > longest
+
+    def _has_changed(self, plain: Bool, evidence: Evidence) -> bool:
+        """Whether the curve has another length than the thread ever had."""
+        is_clear = (plain & evidence.alone).mean() > _ALL
+        tolerance = _LENGTH_TOLERANCE if is_clear else _CROWDED_TOLERANCE
+        length, noise = length_of(self.model.curve), _noise(evidence)
+        lengths = self.known_length, length_of(self.last_good)
+        return all(abs(length - known) > tolerance * known + noise for known in lengths)
 
     def _judge(
         self, evidence: Evidence, wrong: Bool, plain: Bool, overlong: bool, seconds: float
@@ -165,8 +186,9 @@ class Follower:
             self.known_length = min(self.known_length, model.ends.length)
         doubted = wrong | self._doubt.anywhere
         certain = doubted.mean() <= ASTRAY and not overlong and not self._short
-        if certain and plain.mean() > _ALL and not (self._lost or self._cut):
-            self._learn_length(seconds)
+        whole = plain.mean() > _ALL and bool(plain[[0, 1, -2, -1]].all())
+        if certain and whole and not (self._lost or self._cut):
+            self._learn_length(seconds, may_grow=(plain & evidence.alone).mean() > _ALL)
         if not certain:
             self._doubted_ns = model.capture_ns
         if (model.capture_ns - self._doubted_ns) * _NS > _SURE_AFTER_S:
@@ -174,26 +196,26 @@ class Follower:
         unseen_s = (model.capture_ns - model.seen_ns) * _NS
         uncertain_s = (model.capture_ns - self._certain_ns) * _NS
         status = judge(evidence, unseen_s, uncertain_s)
-        length = length_of(model.curve)
-        lengths = self.known_length, length_of(self.last_good)
-        changed = all(abs(length / known - 1) > _LENGTH_TOLERANCE for known in lengths)
-        if self._lost and changed:
+        if status is Status.TRACKING and self._makes_detour(plain, evidence):
+            status = Status.OCCLUDED
+        if self._lost and self._has_changed(plain, evidence):
             status = Status.LOST
         self._lost = status is Status.LOST
         if status is Status.TRACKING:
             self.last_good = model.curve
-        elif self._lost and (evidence.share < _SOME or length < _LEAST_LEFT * self.known_length):
+        elif self._lost and (evidence.share < _SOME or self._is_rest):
             self._start_again()
         elif uncertain_s > _PATIENCE_S and self.config.method != "paper":
             self._trim(wrong | self._doubt.hopeless)
         return status
 
-    def _learn_length(self, seconds: float) -> None:
+    def _learn_length(self, seconds: float, *, may_grow: bool) -> None:
         """An end that is lost for a moment makes the thread no shorter."""
         ends = self.model.ends
-        longest = max(self.known_length, ends.length)
+        length = ends.length if may_grow else min(ends.length, self.known_length)
+        longest = max(self.known_length, length)
         fading = 0.0 if ends.settled else math.exp(-max(seconds, 0.0) / _FORGOTTEN_S)
-        self.known_length = ends.length + (longest - ends.length) * fading
+        self.known_length = length + (longest - length) * fading
 
     @property
     def _short(self) -> bool:
@@ -202,6 +224,11 @@ class Follower:
         self._cut &= length < (1 - _GROWTH) * self.known_length
         self._cut &= not self.model.ends.at_border
         return self._cut and length < (1 - _LENGTH_TOLERANCE) * self.known_length
+
+    @property
+    def _is_rest(self) -> bool:
+        """Whether little is left of the curve."""
+        return length_of(self.model.curve) < _LEAST_LEFT * self.known_length
 
     def _trim(self, wrong: Bool) -> None:
         """Cuts off what has left the thread at an end, to be found anew."""
@@ -239,7 +266,7 @@ class Follower:
         best = self._search(predicted, field, neighbours)
         model.curve = best.fit.curve
         if best.share > 0.3:
-            self._adjust_ends(field)
+            self._adjust_ends(field, best.fit.crowded)
         start, stop = doubled_ends(model.curve, self.rig)
         if start or stop:
             model.curve = nurbs.part(model.curve, start, 1.0 - stop)
@@ -272,18 +299,20 @@ class Follower:
         self._share = best.share
         return best
 
-    def _adjust_ends(self, field: RidgeField) -> None:
+    def _adjust_ends(self, field: RidgeField, crowded: Bool) -> None:
         model = self.model
-        steps = [self._end_step(end, field) for end in (0, 1)]
+        tips = crowded[:_TIP], crowded[-_TIP:]
+        steps = [self._end_step(end, field, alone=not tips[end].any()) for end in (0, 1)]
         start, stop = model.ends.moves(
             steps[0], steps[1], length_of(model.curve), field.stamp.capture_ns
         )
         if start or stop:
             model.curve = _with_ends(model.curve, -start, 1.0 + stop)
 
-    def _end_step(self, end: int, field: RidgeField) -> EndStep | None:
+    def _end_step(self, end: int, field: RidgeField, *, alone: bool) -> EndStep | None:
         model, now_ns = self.model, field.stamp.capture_ns
         step = find_end(model.curve, end, field, self.rig, model.levels)
+        step = step and replace(step, alone=alone)
         other = self._mouths[1 - end]
         return self._mouths[end].steady(step, model.curve, end, other, self.rig, now_ns)
 
@@ -310,6 +339,11 @@ class Follower:
             seen=seen,
             events=tuple(events),
         )
+
+
+def _noise(evidence: Evidence) -> float:
+    """What noise in depth makes of a length."""
+    return _NOISE_SIGMAS * float(np.median(evidence.evenly()[0]))
 
 
 def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[float, float]:

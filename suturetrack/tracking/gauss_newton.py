@@ -17,6 +17,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.kernels import search, spline
 from suturetrack.nurbs import curve_from
 from suturetrack.tracking.config import TrackingConfig
+from suturetrack.tracking.crowding import crowded
 from suturetrack.tracking.sampling import Samples, View, views
 from suturetrack.tracking.strands import NOBODY, SAME_STRAND_PX, Neighbours, Strand
 from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField
@@ -32,6 +33,10 @@ _REFINED_PX = 3.0
 _SHORTEST_RUN_PX = 10.0
 _OUTLIER_PX = 1.0
 _HIDDEN_DRIFT_PX = 3.0
+# What a measurement is worth where another ridge draws it aside, and what the prediction is, there
+# and in depth, against its errors around.
+_CROWDED_WORTH, _CROWDED_HOLD = 0.02, 0.3
+_LEAST_SURPRISE_PX, _SMOOTH = 0.3, 9
 # A first search does not know the thread's direction yet where it has bent.
 _LENIENCY = 0.4
 _EVEN = 150.0
@@ -64,6 +69,8 @@ class Fit:
     """(k, 2) px between the curve and what was found, left and right; nan where nothing was."""
     covariance: Float64
     """(k, 3, 3) of the samples' positions."""
+    crowded: Bool
+    """(k,) where another ridge runs close beside the thread."""
 
 
 def search_normals(
@@ -121,18 +128,22 @@ def fit(
     samples = Samples.of(predicted.knots, config.samples_per_span)
     reference = _Reference.of(samples, predicted)
     control_points = predicted.control_points
+    crowd = _crowd(predicted, samples, field, rig, levels, neighbours)
+    surprise: Float64 | None = None
     faded = expected(before, predicted, samples, rig, levels)
     reach, outlier = reach_px, math.inf
     rounds = config.iterations + round(math.log2(max(reach_px / config.search_px, 1.0)))
     for _ in range(rounds):
         linear = _Linearized(samples, control_points, field, rig, faded, reach, neighbours)
-        equations = linear.equations(reference, faded, config, outlier)
+        surprise = linear.surprise(crowd) if surprise is None else surprise
+        equations = linear.equations(reference, faded, config, outlier, crowd, surprise)
         control_points = control_points + equations.solve()
         outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
         reach = max(reach / 2, _REFINED_PX)
     curve = curve_from(spline.DEGREE, predicted.knots, control_points)
     residual = _residual(rig.project(samples.values(control_points)), linear)
-    return Fit(curve, samples, linear.offsets, residual, equations.covariance(samples))
+    covariance = equations.covariance(samples)
+    return Fit(curve, samples, linear.offsets, residual, covariance, crowd)
 
 
 def observe(
@@ -146,11 +157,26 @@ def observe(
     """What the field says about a curve that something else has fitted."""
     samples = Samples.of(curve.knots, config.samples_per_span)
     still = expected(curve, curve, samples, rig, levels)
+    crowd = _crowd(curve, samples, field, rig, levels, neighbours)
     linear = _Linearized(samples, curve.control_points, field, rig, still, _REFINED_PX, neighbours)
-    equations = linear.equations(_Reference.of(samples, curve), still, config, _OUTLIER_PX)
+    reference, surprise = _Reference.of(samples, curve), linear.surprise(crowd)
+    equations = linear.equations(reference, still, config, _OUTLIER_PX, crowd, surprise)
     equations.solve()
     residual = _residual([view.pixels for view in linear.views], linear)
-    return Fit(curve, samples, linear.offsets, residual, equations.covariance(samples))
+    covariance = equations.covariance(samples)
+    return Fit(curve, samples, linear.offsets, residual, covariance, crowd)
+
+
+def _crowd(
+    curve: Nurbs,
+    samples: Samples,
+    field: RidgeField,
+    rig: StereoRig,
+    levels: tuple[float, float],
+    neighbours: Neighbours,
+) -> Bool:
+    points, first = samples.values(curve.control_points), samples.values(curve.control_points, 1)
+    return crowded(views(rig, points, first), samples.share, field, levels, neighbours)
 
 
 def expected(
@@ -223,13 +249,17 @@ class _Linearized:
         levels: tuple[Float64, Float64],
         config: TrackingConfig,
         outlier_px: float,
+        crowd: Bool,
+        surprise: Float64,
     ) -> _Equations:
         """The normal equations of the next step."""
         equations = _Equations(int(self.samples.first[-1]) + spline.ORDER)
         self._add_prediction(equations, reference, config)
+        self._add_hold(equations, reference, crowd, surprise)
         self._add_shape(equations, reference, config)
+        worth = np.where(crowd, _CROWDED_WORTH, 1.0)
         for view, found, level in zip(self.views, self.offsets, levels, strict=True):
-            weight = self._amount(view) / config.noise_px**2
+            weight = worth * self._amount(view) / config.noise_px**2
             weight = weight * found.found * np.clip(found.response / level, 0, 1) ** 2
             weight = weight / (1 + (found.offset / outlier_px) ** 2) ** 2
             row = (view.normals[:, None, :] @ view.jacobian)[:, 0, :]
@@ -239,19 +269,22 @@ class _Linearized:
     def _add_prediction(
         self, equations: _Equations, reference: _Reference, config: TrackingConfig
     ) -> None:
-        """The drift is one of pixels, so that the past holds depth no tighter than the images do.
-
-        Where the thread is hidden, the past is all there is, and holds it in depth as well.
-        """
+        """The drift is one of pixels, so that the past holds depth no tighter than the images do."""
         weight = self._amount(self.views[0]) / config.drift_px**2 / 2
-        information = sum(
-            weight[:, None, None] * (view.jacobian.transpose(0, 2, 1) @ view.jacobian)
-            for view in self.views
-        )
-        held = self._hidden * self._amount(self.views[0]) / (_HIDDEN_DRIFT_PX * self._pixel) ** 2
-        information = information + held[:, None, None] * np.eye(3)
+        left, right = (view.jacobian.transpose(0, 2, 1) @ view.jacobian for view in self.views)
+        information = weight[:, None, None] * (left + right)
         away = (reference.points - self.points)[:, :, None]
         equations.add(self.samples, 0, information, (information @ away)[:, :, 0])
+
+    def _add_hold(
+        self, equations: _Equations, reference: _Reference, crowd: Bool, surprise: Float64
+    ) -> None:
+        """Where the thread is hidden or not alone, the past holds it in depth as well."""
+        firmness = self._hidden / _HIDDEN_DRIFT_PX**2
+        firmness = firmness + _CROWDED_HOLD * crowd / surprise**2
+        held: Float64 = firmness * self._amount(self.views[0]) / self._pixel**2
+        away = reference.points - self.points
+        equations.add(self.samples, 0, held[:, None, None] * np.eye(3), held[:, None] * away)
 
     def _add_shape(
         self, equations: _Equations, reference: _Reference, config: TrackingConfig
@@ -270,6 +303,16 @@ class _Linearized:
         information = bending[:, None, None] * np.eye(3) + stretch[:, None, None] * along
         pull = (information @ goal[:, :, None])[:, :, 0]
         equations.add(self.samples, 2, information, pull)
+
+    def surprise(self, crowd: Bool) -> Float64:
+        """(k,) px by which the thread has left the curve where it is alone, and so in between."""
+        left, right = (np.where(crowd, 0.0, np.abs(found.offset)) for found in self.offsets)
+        away, either, s = np.maximum(left, right), ~(crowd | self._hidden), self.samples.s
+        if not either.any():
+            return np.ones(len(s))
+        padded = np.pad(away[either], _SMOOTH // 2, mode="edge")
+        smooth = np.convolve(padded, np.full(_SMOOTH, 1 / _SMOOTH), "valid")
+        return np.asarray(_LEAST_SURPRISE_PX + np.interp(s, s[either], smooth))
 
     def _amount(self, view: View) -> Float64:
         """(k,) how many independent measurements each sample stands for."""

@@ -55,6 +55,11 @@ class Evidence:
         sigma = np.sqrt(np.trace(self.fit.covariance, axis1=1, axis2=2))
         return np.interp(at, s, sigma), self._even(self.seen)
 
+    @property
+    def alone(self) -> Bool:
+        """(k,) whether no other ridge runs close beside the thread, at evenly spaced parameters."""
+        return ~self._even(self.fit.crowded)
+
     def astray(
         self,
         field: RidgeField,

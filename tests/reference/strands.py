@@ -27,12 +27,12 @@ def claimed(strand: Strand, others: Strand, offsets: Float64, apart: float) -> B
     return np.asarray((nearer & rivals[:, :, None]).any(axis=1))
 
 
-def doubled(strand: Strand, others: Strand, apart: float) -> Bool:
+def doubled(strand: Strand, others: Strand, apart: float, near: float = APART_PX) -> Bool:
     """See `suturetrack.kernels.search.doubled`."""
     across, _, parallel, along = _relative(strand, others)
     step = np.abs(others[0] - strand[0][:, None])
-    same = (np.abs(across) < APART_PX) & (parallel > PARALLEL) & (along >= apart)
-    return np.asarray((same & (step <= CLAIM_PX).all(axis=2)).any(axis=1))
+    same = (np.abs(across) < near) & (parallel > PARALLEL) & (along >= apart)
+    return np.asarray((same & (step <= max(near, CLAIM_PX)).all(axis=2)).any(axis=1))
 
 
 def covered(
