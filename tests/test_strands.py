@@ -1,4 +1,4 @@
-"""Which arms of a crossing are one strand, by their depth and by how they bend."""
+"""Which ridges that meet are one strand: by depth, by how they bend, and by their strength."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from suturetrack.camera import StereoRig
+from suturetrack.initialization import initialize
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.pricing import Merge
 from suturetrack.initialization.strands import Strands
-from suturetrack.types import Float32, Float64
-from tests.test_initialization import draw, field_of
+from suturetrack.metrics import curve_error
+from suturetrack.types import Float32, Float64, Nurbs, Seed
+from tests.test_initialization import dense, draw, field_of
 
 DISPARITY = 160.0
 
@@ -75,3 +77,18 @@ def test_strands_that_cross_go_straight_on() -> None:
     assert strands.change(touching, straight) == pytest.approx(-change)
     short = Strands(tuple(e[:5] for e in ends), {}, merges, None)
     assert short.change(straight, touching) is None
+
+
+def test_a_faint_ridge_behind_an_end_is_no_thread(rig: StereoRig, curve: Nurbs) -> None:
+    truth = dense(curve)
+    views = []
+    for pixels in rig.project(truth):
+        vein = draw(pixels[1000:], rig).astype(float)
+        faint = np.rint(190 + 0.35 * (vein - 190)).astype(np.uint8)
+        views.append(draw(pixels[:1000], rig, faint))
+    seed = Seed(pixel=tuple(rig.project(truth[500])[0]))
+    found = initialize(field_of(views[0], views[1], rig), rig, seed)
+    error = curve_error(dense(found.curve), truth[:1000])
+    assert max(error.ends) < 1.5
+    assert abs(error.length_percent) < 2
+    assert any("a fainter ridge behind an end" in reason for reason in found.reasons)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.model import InitializationConfig, ViewGrowth
@@ -16,6 +17,16 @@ from suturetrack.types import Bool, Float32, Float64
 
 _FAINT = 0.4
 """Strength, against the rest of the thread, below which a last segment is no part of it."""
+_FALLEN = 0.42
+"""Strength, against the rest of the thread, of what goes on behind its end at most."""
+_FALL = 0.5
+"""Ratio of the strengths behind and before such an end at most: threads fade more slowly."""
+_FAINTER = 0.6
+"""What such an end leaves of the confidence."""
+_SHORTEST_TAIL = 24
+"""Points that go on so, at least: what is shorter may be the thread's own end, in the shade."""
+_WINDOW, _STEP_POINTS = 10, 3
+"""Points whose strength counts on each side of an end, and those about it that do not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +88,40 @@ def follow_thread(
     pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
     chain = replace(_join(pieces), doubts=doubts)
     return Thread(ridges, entries, origin, chain)
+
+
+def without_faint_tails(thread: Thread, place: Float64) -> Thread:
+    """The thread through `place` (2,), cut where its strength falls at once and for good: it ends
+    there at a vein, or at another thread, that goes on in its direction."""
+    chain = thread.chain
+    strength = thread.ridges.sample(chain.pixels)
+    near = int(np.argmin(np.linalg.norm(chain.pixels - place, axis=1)))
+    stop = _falls_at(strength, near)
+    start = len(strength) - _falls_at(strength[::-1], len(strength) - 1 - near)
+    if stop - start == len(strength):
+        return thread
+    pixels = chain.pixels[start:stop]
+    doubts = [d for d in chain.doubts if np.linalg.norm(pixels - d[0], axis=1).min() < _WINDOW]
+    cut = [end for end, at in ((0, start), (-1, len(strength) - stop)) if at > 0]
+    doubts += [(pixels[end], "a fainter ridge behind an end", _FAINTER) for end in cut]
+    return replace(thread, chain=Chain(pixels, chain.seen[start:stop], tuple(doubts)))
+
+
+def _falls_at(strength: Float64, first: int) -> int:
+    """Where behind the point `first` a chain falls far below its strength; its length if nowhere."""
+    aside = _WINDOW + _STEP_POINTS
+    if len(strength) <= first + aside + _SHORTEST_TAIL:
+        return len(strength)
+    medians = np.median(sliding_window_view(strength, _WINDOW), axis=1)
+    places = np.arange(first + aside, len(strength) - _SHORTEST_TAIL + 1)
+    fall = medians[places + _STEP_POINTS] / np.maximum(medians[places - aside], 1e-9)
+    for k in np.argsort(fall):
+        place = int(places[k])
+        if fall[k] > _FALL:
+            break
+        if np.median(strength[place:]) < _FALLEN * np.median(strength[:place]):
+            return place
+    return len(strength)
 
 
 def grow_thread(thread: Thread, seed: Float64, config: InitializationConfig) -> ViewGrowth:

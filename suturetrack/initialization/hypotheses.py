@@ -8,7 +8,13 @@ import numpy as np
 
 from suturetrack.initialization.confidence import clarity
 from suturetrack.initialization.depth import Depth
-from suturetrack.initialization.growth import Chain, Thread, follow_thread, nearest_segment
+from suturetrack.initialization.growth import (
+    Chain,
+    Thread,
+    follow_thread,
+    nearest_segment,
+    without_faint_tails,
+)
 from suturetrack.initialization.matching import Match, match
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.segments import Ridges
@@ -78,6 +84,7 @@ def find_thread(
         left = follow_thread(
             ridges[0], origin, config, Depth.around(apart, field.left, field.right)
         )
+        left = without_faint_tails(left, seed)
         matched = match(left.chain, field.left, field.right, nearest, 1)
     there = matched.pixels[_closest(left.chain.pixels, seed)]
     partner, _ = nearest_segment(ridges[1], there, np.inf)
@@ -89,6 +96,7 @@ def find_thread(
         config,
         Depth.around(-apart, field.right, field.left) if len(apart) else None,
     )
+    right = without_faint_tails(right, there)
     first = Hypothesis(left, right, matched)
     if _agreement(matched.pixels[matched.inside], right.chain.pixels) >= AGREED:
         return first
