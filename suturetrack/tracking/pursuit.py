@@ -50,6 +50,10 @@ class Pursuit:
             return state
         return self._find_once_more(state, field, others) or state
 
+    def lies_on(self, others: Neighbours) -> bool:
+        """Whether what is followed now is one of the other threads."""
+        return lies_on(self.follower.model.curve, others, self.follower.rig)
+
     def _is_fresh(self, field: RidgeField) -> bool:
         return self._found is not None and 0 < field.stamp.capture_ns - self._found[0] < _JUST_NS
 

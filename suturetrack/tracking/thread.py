@@ -152,13 +152,16 @@ class Thread:
         before = copy.copy(self.follower) if self._was_sure else None
         return Closer(Seed(self.name, point=(x, y, z)), self._setup, curve, before)
 
-    def take_up(self, look: Look) -> None:
-        """Goes on with what a look found, if that is worth more."""
+    def take_up(self, look: Look, others: Neighbours) -> None:
+        """Goes on with what a look found, if that is worth more.
+
+        Who was lost when the look began may be held by now where it has led.
+        """
         self._rest = max(self._rest - look.fields + 1, 0)
         outcome, search = look.outcome(), look.search
         if isinstance(search, FromSeed):
             self._take_first(outcome, look.fields)
-        elif outcome.state is None or outcome.state.status is Status.LOST:
+        elif outcome.pursuit is None or outcome.pursuit.lies_on(others):
             return
         elif isinstance(search, Again):
             self._take_again(outcome)
@@ -188,6 +191,8 @@ class Thread:
         assert isinstance(outcome.found, Initialization)
         assert self._sureness is not None
         found = outcome.found
+        if outcome.state is None or outcome.state.status is Status.LOST:
+            return
         if self._sureness.weigh(found.confidence, found.curve, search.followed):
             self._seeded_at = _nearest(found.curve, search.seed, self._setup.rig)
             event = "found for sure" if self._sureness.is_sure else "found elsewhere"

@@ -130,10 +130,11 @@ class Tracker:
         if look is None:
             return
         thread = self._threads[look.thread]
-        look.add(self._worker, field, self._others(thread, field))
+        others = self._others(thread, field)
+        look.add(self._worker, field, others)
         if field.stamp.capture_ns >= look.due_ns:
             self._look = None
-            thread.take_up(look)
+            thread.take_up(look, others)
             yield look
 
     def _begin_to_look(self, field: RidgeField, held: set[str]) -> Iterator[Look]:
@@ -155,7 +156,7 @@ class Tracker:
                 self._look = look
             else:
                 look.at_once(others)
-                thread.take_up(look)
+                thread.take_up(look, others)
                 yield look
 
     def _others(self, thread: Thread, field: RidgeField) -> Neighbours:
