@@ -41,11 +41,12 @@ def crowded(
 
 def _beside(image: Float32, view: View, share: Float64, level: float, others: Strand) -> Bool:
     own, lengths = Strand.of(view, share), view.speed * share
-    known = search.doubled(own.arrays, own.joined(others).arrays, SAME_STRAND_PX, _NEAR_PX)
+    known = search.doubled(own.arrays, others.arrays, SAME_STRAND_PX, _NEAR_PX)
+    itself = search.doubled(own.arrays, own.arrays, SAME_STRAND_PX, _GRID_PX[-1])
     profiles = search.normal_profiles(image, view.pixels, view.tangents, _GRID_PX)
     inner = profiles[:, 1:-1]
     summits = (inner > profiles[:, :-2]) & (inner >= profiles[:, 2:]) & (inner > _CLEAR * level)
-    several = search.solid(summits.sum(axis=1) > 1, lengths, _SHORTEST_PX)
+    several = search.solid((summits.sum(axis=1) > 1) & ~itself, lengths, _SHORTEST_PX)
     return known | several
 
 

@@ -181,7 +181,7 @@ class Follower:
     ) -> Status:
         """The status; a curve that was lost must have its length again to be held."""
         model = self.model
-        if plain.mean() > _ALL and model.ends.settled and self._cut:
+        if plain.mean() >= 1 - ASTRAY and model.ends.settled and self._cut:
             self._cut = False
             self.known_length = min(self.known_length, model.ends.length)
         doubted = wrong | self._doubt.anywhere

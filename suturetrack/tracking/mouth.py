@@ -1,4 +1,4 @@
-"""Where a thread comes out of something: an end that keeps its place while the thread slides through."""
+"""Where a thread comes out of something: an end that keeps its place while the thread grows longer."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from suturetrack.tracking.ends import EndStep
 from suturetrack.tracking.sampling import length_of, values_at
 from suturetrack.types import Float64, Nurbs
 
-# An end is at a mouth when it has stayed within this for so long while the thread became longer or
-# shorter by so many px and such a part, more than errors in depth make of a length.
+# An end is at a mouth when it has stayed within this for so long while the thread became longer by so many
+# px and such a part, more than errors in depth make of a length. A knot that is drawn tight makes it shorter.
 _STAYS_PX, _STAYS_NS = 8.0, 500_000_000
-_SLID_PX, _SLID = 10.0, 0.04
+_DRAWN_PX, _DRAWN = 10.0, 0.04
 # It has left one when it was further away, or not to be seen, for so long.
 _LEAVES_PX, _LEAVES_NS = 12.0, 400_000_000
-# An end that jumps has not slid; a mouth draws an end by no more at a time.
+# An end that jumps has not been drawn out; a mouth draws an end by no more at a time.
 _CALM_PX = 4.0
 # Weight of the newest place in the mean, at least.
 _NEWEST = 0.01
@@ -86,8 +86,8 @@ class Mouth:
             self._place = self._place + (shown - self._place) * max(1 / self._count, _NEWEST)
         has_stayed = now_ns - self.since_ns > _STAYS_NS and abs(step.offset_px) < _CALM_PX
         if has_stayed and other.since_ns > self.since_ns:
-            slid = abs(length - self._length)
-            self.is_open |= slid > max(_SLID_PX * self._pixel, _SLID * self._length)
+            drawn_out = length - self._length
+            self.is_open |= drawn_out > max(_DRAWN_PX * self._pixel, _DRAWN * self._length)
 
     def _away(self, shown: Float64, rig: StereoRig) -> float:
         """How far from the mean place the end shows, px: the images tell little of its depth."""
