@@ -24,7 +24,9 @@ def crowded(
     levels: tuple[float, float],
     neighbours: Neighbours,
 ) -> Bool:
-    """(k,) samples beside which a known strand or an unknown ridge runs, in either image.
+    """(k,) samples beside which another thread or an unknown ridge runs, in either image.
+
+    The thread's own strands do not count: in a knot they are all there is to go by.
 
     Args:
         both: the samples as predicted, left and right.
