@@ -154,7 +154,7 @@ def test_a_place_belongs_to_the_strand_that_is_nearest() -> None:
     offsets = np.arange(-8.0, 8.1, 1.0)
     taken = search.claimed(own, beside, offsets, 45.0)[20]
     assert offsets[taken].tolist() == [4.0, 5.0, 6.0, 7.0, 8.0]
-    assert not search.doubled(own, beside, 45.0).any()
+    assert not search.doubled(own, beside, 45.0, 2.0).any()
     assert search.doubled(own, beside, 45.0, 6.5).all()
-    assert search.doubled(own, (own[0], east, np.full(40, np.inf)), 45.0).all()
-    assert not search.doubled(own, own, 45.0).any()
+    assert search.doubled(own, (own[0], east, np.full(40, np.inf)), 45.0, 2.0).all()
+    assert not search.doubled(own, own, 45.0, 2.0).any()

@@ -45,7 +45,7 @@ def find_crest(field: Float32, pixels: Float64) -> Crest:
     """Looks for the crest across (k, 2) evenly spaced pixels of a projected curve."""
     tangents = np.gradient(pixels, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-    profiles = search.normal_profiles(field, pixels, tangents, _OFFSETS)
+    profiles = search.normal_profiles(field, pixels, tangents, _OFFSETS, 0.0)
     expected = profiles * np.exp(-0.5 * (_OFFSETS / _NEAR_PX) ** 2)
     peak = np.argmax(expected, axis=1)
     around = np.arange(-_CENTROID_REACH, _CENTROID_REACH + 1)

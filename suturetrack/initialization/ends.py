@@ -42,7 +42,7 @@ def read_end(field: Float32, pixels: Float64) -> EndReading:
     places = np.where(x[:, None] <= 0, inside, pixels[0] + x[:, None] * outward)
     tangents = np.gradient(places, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    response = search.normal_profiles(field, places, tangents, _BESIDE).max(1)
+    response = search.normal_profiles(field, places, tangents, _BESIDE, 0.0).max(1)
     level = _END_LEVEL * float(np.median(response[x < -4]))
     run = int(_STAYS_PX / _STEP_PX)
     later = np.convolve(response, np.ones(run) / run)[run - 1 :]

@@ -11,7 +11,9 @@ from suturetrack.types import Bool, Float32, Float64
 Int64 = NDArray[np.int64]
 
 # A strand claims the ridge so far to its sides; two that are nearer than this make one ridge.
-_CLAIM_PX, _APART_PX = 4.0, 2.0
+_CLAIM_PX, APART_PX = 4.0, 2.0
+# Points of a strand that are looked at, or passed over, together.
+_BLOCK = 8
 # Cosine of the angle up to which two strands may be mistaken for one another.
 _PARALLEL = 0.8
 
@@ -69,22 +71,64 @@ def magnitudes(field: Float32, pixels: Float64) -> Float64:
 
 @numba.njit(cache=True, nogil=True)
 def normal_profiles(
-    field: Float32, pixels: Float64, tangents: Float64, offsets: Float64, leniency: float = 0.0
+    field: Float32, pixels: Float64, tangents: Float64, offsets: Float64, leniency: float
 ) -> Float64:
     """(k, m) responses at the m offsets along the normals (-tv, tu) of the k samples.
 
     `leniency` is the share of |V| itself, whatever its direction, in the response.
     """
     out = np.empty((len(pixels), len(offsets)))
+    vectors, shares = np.empty((4, 2, len(offsets)), np.float32), np.empty((4, len(offsets)))
+    across = np.empty(len(offsets))
     for j in range(len(pixels)):
-        u, v, tu, tv = pixels[j, 0], pixels[j, 1], tangents[j, 0], tangents[j, 1]
-        for i in range(len(offsets)):
-            x, y = u - offsets[i] * tv, v + offsets[i] * tu
-            out[j, i] = response_at(field, x, y, tu, tv)
-            if leniency > 0:
-                any_way = out[j, i] + response_at(field, x, y, -tv, tu)
+        tu, tv = tangents[j, 0], tangents[j, 1]
+        _gather(field, pixels[j], tangents[j], offsets, vectors, shares)
+        _respond(vectors, shares, tu, tv, out[j])
+        if leniency > 0:
+            _respond(vectors, shares, -tv, tu, across)
+            for i in range(len(offsets)):
+                any_way = out[j, i] + across[i]
                 out[j, i] += leniency * (any_way - out[j, i])
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(
+    field: Float32,
+    pixel: Float64,
+    tangent: Float64,
+    offsets: Float64,
+    vectors: Float32,
+    shares: Float64,
+) -> None:
+    """The four vectors around each place along a normal and what they count; 0 outside the image."""
+    height, width = field.shape[0], field.shape[1]
+    for i in range(len(offsets)):
+        u, v = pixel[0] - offsets[i] * tangent[1], pixel[1] + offsets[i] * tangent[0]
+        if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+            vectors[:, :, i] = 0.0
+            shares[:, i] = 0.0
+            continue
+        column, row = min(int(u), width - 2), min(int(v), height - 2)
+        fu, fv = u - column, v - row
+        for c in range(4):
+            down, right = c >> 1, c & 1
+            vectors[c, 0, i] = field[row + down, column + right, 0]
+            vectors[c, 1, i] = field[row + down, column + right, 1]
+            shares[c, i] = (fv if down else 1 - fv) * (fu if right else 1 - fu)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _respond(vectors: Float32, shares: Float64, tu: float, tv: float, out: Float64) -> None:
+    """`response_at` for the places of `_gather`, without a branch, so that many go at a time."""
+    out[:] = 0.0
+    for c in range(4):
+        x, y, share = vectors[c, 0], vectors[c, 1], shares[c]
+        for i in range(len(out)):
+            squared = x[i] * x[i] + y[i] * y[i]
+            along = tu * x[i] + tv * y[i]
+            response = share[i] * along * along / np.sqrt(squared)
+            out[i] += response if squared > 0 else 0.0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -97,19 +141,22 @@ def best_path(gain: Float64, stiffness: float, reach: int) -> Int64:
         reach: the largest step.
     """
     count, width = gain.shape
-    origin = np.zeros((count, width), np.int64)
-    best = gain[0].copy()
+    origin = np.empty((count, width), np.int64)
+    padded = np.full(width + 2 * reach, -np.inf)
+    best, top = padded[reach : reach + width], np.empty(width)
+    best[:] = gain[0]
     for j in range(1, count):
-        new = np.empty(width)
+        where = origin[j]
+        top[:] = -np.inf
+        for step in range(-reach, reach + 1):
+            before, price = padded[reach + step :], stiffness * step * step
+            for i in range(width):
+                value = before[i] - price
+                better = value > top[i]
+                top[i] = value if better else top[i]
+                where[i] = i + step if better else where[i]
         for i in range(width):
-            top, where = -np.inf, i
-            for h in range(max(0, i - reach), min(width, i + reach + 1)):
-                value = best[h] - stiffness * (i - h) * (i - h)
-                if value > top:
-                    top, where = value, h
-            new[i] = top + gain[j, i]
-            origin[j, i] = where
-        best = new
+            best[i] = top[i] + gain[j, i]
     path = np.empty(count, np.int64)
     path[count - 1] = np.argmax(best)
     for j in range(count - 1, 0, -1):
@@ -161,6 +208,25 @@ def peaks(profiles: Float64, path: Int64, half: int) -> tuple[Float64, Float64]:
 
 
 @numba.njit(cache=True, nogil=True)
+def _boxes(points: Float64) -> Float64:
+    """(n, 4) lowest and highest u, lowest and highest v of each `_BLOCK` points in a row."""
+    count = (len(points) + _BLOCK - 1) // _BLOCK
+    boxes = np.empty((count, 4))
+    for b in range(count):
+        block = points[b * _BLOCK : (b + 1) * _BLOCK]
+        for a in range(2):
+            boxes[b, 2 * a], boxes[b, 2 * a + 1] = block[:, a].min(), block[:, a].max()
+    return boxes
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_far(box: Float64, pixel: Float64, far: float) -> bool:
+    """Whether all points in a box lie further from the pixel than `far`, in u or in v."""
+    u, v = pixel[0], pixel[1]
+    return box[0] - u > far or u - box[1] > far or box[2] - v > far or v - box[3] > far
+
+
+@numba.njit(cache=True, nogil=True)
 def claimed(
     strand: tuple[Float64, Float64, Float64],
     others: tuple[Float64, Float64, Float64],
@@ -178,21 +244,24 @@ def claimed(
     pixels, tangents, along = strand
     other_pixels, other_tangents, other_along = others
     out = np.zeros((len(pixels), len(offsets)), np.bool_)
-    far = np.abs(offsets).max() + _CLAIM_PX
+    far, boxes = np.abs(offsets).max() + _CLAIM_PX, _boxes(other_pixels)
     for j in range(len(pixels)):
         tu, tv = tangents[j, 0], tangents[j, 1]
-        for q in range(len(other_pixels)):
-            du, dv = other_pixels[q, 0] - pixels[j, 0], other_pixels[q, 1] - pixels[j, 1]
-            if abs(du) > far or abs(dv) > far or abs(other_along[q] - along[j]) < apart:
+        for b in range(len(boxes)):
+            if _is_far(boxes[b], pixels[j], far):
                 continue
-            across, ahead = dv * tu - du * tv, du * tu + dv * tv
-            parallel = abs(tu * other_tangents[q, 0] + tv * other_tangents[q, 1])
-            if abs(ahead) > _CLAIM_PX or abs(across) < _APART_PX or parallel < _PARALLEL:
-                continue
-            for i in range(len(offsets)):
-                away = abs(offsets[i] - across)
-                if away < _CLAIM_PX and away < abs(offsets[i]):
-                    out[j, i] = True
+            for q in range(b * _BLOCK, min((b + 1) * _BLOCK, len(other_pixels))):
+                du, dv = other_pixels[q, 0] - pixels[j, 0], other_pixels[q, 1] - pixels[j, 1]
+                if abs(du) > far or abs(dv) > far or abs(other_along[q] - along[j]) < apart:
+                    continue
+                across, ahead = dv * tu - du * tv, du * tu + dv * tv
+                parallel = abs(tu * other_tangents[q, 0] + tv * other_tangents[q, 1])
+                if abs(ahead) > _CLAIM_PX or abs(across) < APART_PX or parallel < _PARALLEL:
+                    continue
+                for i in range(len(offsets)):
+                    away = abs(offsets[i] - across)
+                    if away < _CLAIM_PX and away < abs(offsets[i]):
+                        out[j, i] = True
     return out
 
 
@@ -201,7 +270,7 @@ def doubled(
     strand: tuple[Float64, Float64, Float64],
     others: tuple[Float64, Float64, Float64],
     apart: float,
-    near: float = _APART_PX,
+    near: float,
 ) -> Bool:
     """(k,) samples of a strand that lie on another one, less than `near` px beside it.
 
@@ -210,17 +279,18 @@ def doubled(
     pixels, tangents, along = strand
     other_pixels, other_tangents, other_along = others
     out = np.zeros(len(pixels), np.bool_)
-    far = max(near, _CLAIM_PX)
+    far, boxes = max(near, _CLAIM_PX), _boxes(other_pixels)
     for j in range(len(pixels)):
-        for q in range(len(other_pixels)):
-            du, dv = other_pixels[q, 0] - pixels[j, 0], other_pixels[q, 1] - pixels[j, 1]
-            if abs(du) > far or abs(dv) > far or abs(other_along[q] - along[j]) < apart:
+        tu, tv = tangents[j, 0], tangents[j, 1]
+        for b in range(len(boxes)):
+            if out[j] or _is_far(boxes[b], pixels[j], far):
                 continue
-            tu, tv = tangents[j, 0], tangents[j, 1]
-            parallel = abs(tu * other_tangents[q, 0] + tv * other_tangents[q, 1])
-            if abs(dv * tu - du * tv) < near and parallel > _PARALLEL:
-                out[j] = True
-                break
+            for q in range(b * _BLOCK, min((b + 1) * _BLOCK, len(other_pixels))):
+                du, dv = other_pixels[q, 0] - pixels[j, 0], other_pixels[q, 1] - pixels[j, 1]
+                if abs(du) > far or abs(dv) > far or abs(other_along[q] - along[j]) < apart:
+                    continue
+                parallel = abs(tu * other_tangents[q, 0] + tv * other_tangents[q, 1])
+                out[j] |= abs(dv * tu - du * tv) < near and parallel > _PARALLEL
     return out
 
 
@@ -230,19 +300,22 @@ def covered(
 ) -> Bool:
     """(k, m) places along the normals of the samples that are nearer than `near` to a point."""
     out = np.zeros((len(pixels), len(offsets)), np.bool_)
-    far = np.abs(offsets).max() + near
+    far, boxes = np.abs(offsets).max() + near, _boxes(points)
     for j in range(len(pixels)):
-        for q in range(len(points)):
-            du, dv = points[q, 0] - pixels[j, 0], points[q, 1] - pixels[j, 1]
-            if abs(du) > far or abs(dv) > far:
+        for b in range(len(boxes)):
+            if _is_far(boxes[b], pixels[j], far):
                 continue
-            across = dv * tangents[j, 0] - du * tangents[j, 1]
-            ahead = du * tangents[j, 0] + dv * tangents[j, 1]
-            if abs(ahead) >= near:
-                continue
-            for i in range(len(offsets)):
-                if (offsets[i] - across) ** 2 + ahead * ahead < near * near:
-                    out[j, i] = True
+            for q in range(b * _BLOCK, min((b + 1) * _BLOCK, len(points))):
+                du, dv = points[q, 0] - pixels[j, 0], points[q, 1] - pixels[j, 1]
+                if abs(du) > far or abs(dv) > far:
+                    continue
+                across = dv * tangents[j, 0] - du * tangents[j, 1]
+                ahead = du * tangents[j, 0] + dv * tangents[j, 1]
+                if abs(ahead) >= near:
+                    continue
+                for i in range(len(offsets)):
+                    if (offsets[i] - across) ** 2 + ahead * ahead < near * near:
+                        out[j, i] = True
     return out
 
 

@@ -31,32 +31,23 @@ def local_basis(s: Float64, knots: Float64) -> tuple[Int64, Float64]:
     count = len(s)
     spans = len(knots) - ORDER
     first = np.empty(count, np.int64)
-    table = np.empty((3, count, ORDER))
+    table = np.zeros((3, count, ORDER))
+    one, two, slope = np.empty(2), np.empty(3), np.empty(3)
     for j in range(count):
         x = s[j]
         span = np.searchsorted(knots, x, side="right") - 1
         span = min(max(span, DEGREE), spans - 1)
         first[j] = span - DEGREE
-        n1 = np.zeros(2)
-        n2 = np.zeros(3)
-        n3 = np.zeros(4)
         width = knots[span + 1] - knots[span]
-        n1[0] = (knots[span + 1] - x) / width
-        n1[1] = (x - knots[span]) / width
-        _raise_degree(n1, n2, 2, x, span, knots)
-        _raise_degree(n2, n3, 3, x, span, knots)
-        d1 = np.zeros(4)
-        d2 = np.zeros(3)
-        lower = np.zeros(3)
-        _differences(n2, d1, 3, span, knots)
-        _differences(n1, lower, 2, span, knots)
-        d2[:] = lower
-        second = np.zeros(4)
-        _differences(d2, second, 3, span, knots)
-        for i in range(ORDER):
-            table[0, j, i] = n3[i]
-            table[1, j, i] = d1[i]
-            table[2, j, i] = second[i]
+        one[0] = (knots[span + 1] - x) / width
+        one[1] = (x - knots[span]) / width
+        two[:] = 0.0
+        slope[:] = 0.0
+        _raise_degree(one, two, 2, x, span, knots)
+        _raise_degree(two, table[0, j], 3, x, span, knots)
+        _differences(two, table[1, j], 3, span, knots)
+        _differences(one, slope, 2, span, knots)
+        _differences(slope, table[2, j], 3, span, knots)
     return first, table
 
 
@@ -84,11 +75,13 @@ def _differences(low: Float64, high: Float64, degree: int, span: int, knots: Flo
 def combine(first: Int64, values: Float64, control_points: Float64) -> Float64:
     """(k, dim) points of (n + 1, dim) control points, by the (k, 4) local basis `values`."""
     count, dim = len(first), control_points.shape[1]
-    points = np.zeros((count, dim))
+    points = np.empty((count, dim))
     for j in range(count):
-        for i in range(ORDER):
-            for a in range(dim):
-                points[j, a] += values[j, i] * control_points[first[j] + i, a]
+        for a in range(dim):
+            total = 0.0
+            for i in range(ORDER):
+                total += values[j, i] * control_points[first[j] + i, a]
+            points[j, a] = total
     return points
 
 

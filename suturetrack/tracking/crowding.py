@@ -45,7 +45,7 @@ def _beside(image: Float32, view: View, share: Float64, level: float, others: St
     own, lengths = Strand.of(view, share), view.speed * share
     known = search.doubled(own.arrays, others.arrays, SAME_STRAND_PX, _NEAR_PX)
     itself = search.doubled(own.arrays, own.arrays, SAME_STRAND_PX, _GRID_PX[-1])
-    profiles = search.normal_profiles(image, view.pixels, view.tangents, _GRID_PX)
+    profiles = search.normal_profiles(image, view.pixels, view.tangents, _GRID_PX, 0.0)
     inner = profiles[:, 1:-1]
     summits = (inner > profiles[:, :-2]) & (inner >= profiles[:, 2:]) & (inner > _CLEAR * level)
     several = search.solid((summits.sum(axis=1) > 1) & ~itself, lengths, _SHORTEST_PX)

@@ -100,7 +100,7 @@ def _normal_offsets(image: Float32, view: View, config: PaperConfig) -> Float64:
     force = config.gain * slope * response / np.maximum(magnitude, 1e-6)
     reach = round(config.search_px / _SEARCH_STEP_PX)
     grid = _SEARCH_STEP_PX * np.arange(-reach, reach + 1)
-    profiles = search.normal_profiles(image, view.pixels, view.tangents, grid)
+    profiles = search.normal_profiles(image, view.pixels, view.tangents, grid, 0.0)
     best = np.argmax(profiles - 1e-3 * np.abs(grid), axis=1)
     flat = (np.abs(force) < config.flat_px) & (profiles.max(axis=1) > response + _CLEARER)
     searched = np.clip(grid[best], -config.largest_step_px, config.largest_step_px)

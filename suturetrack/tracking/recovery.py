@@ -108,7 +108,7 @@ def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
         views(rig, evaluate(curve, s), tangents(curve, s)), others, strict=True
     ):
         own = Strand(view.pixels, view.tangents, np.zeros(len(s)))
-        alone |= ~search.doubled(own.arrays, strand.arrays, 0.0)
+        alone |= ~search.doubled(own.arrays, strand.arrays, 0.0, search.APART_PX)
     return bool(np.mean(~alone) > _SHARED)
 
 

@@ -81,7 +81,10 @@ class Evidence:
         ):
             own = Strand.of(view, samples.share)
             all_seen = own.where(self.seen).joined(others)
-            double = self.seen & search.doubled(own.arrays, all_seen.arrays, SAME_STRAND_PX)
+            on_another = search.doubled(
+                own.arrays, all_seen.arrays, SAME_STRAND_PX, search.APART_PX
+            )
+            double = self.seen & on_another
             unseen &= _beside(image, view, unseen, all_seen, _BESIDE_PX, _NOT_OWN_PX, level)
             left_alone |= _beside(image, view, double, all_seen, _NEXT_PX, _NOT_TAKEN_PX, level)
             plain &= ~double
@@ -105,7 +108,7 @@ def _beside(
     out = np.zeros(len(which), bool)
     if which.any():
         pixels, tangents = view.pixels[which], view.tangents[which]
-        profiles = search.normal_profiles(image, pixels, tangents, offsets)
+        profiles = search.normal_profiles(image, pixels, tangents, offsets, 0.0)
         taken = search.covered(pixels, tangents, offsets, strands.pixels, near)
         out[which] = (np.where(taken, 0.0, profiles) > _CLEAR * level).any(axis=1)
     return out
