@@ -25,6 +25,8 @@ _SHORT = 0.25
 _SWING = 0.01
 """Price of a bridge that bends one way and then the other."""
 _BRIDGE_SAMPLES = 12
+_AT_ONCE = 4096
+"""Pairs priced in one go, so that much clutter takes no more memory."""
 TOUCHING_PX = 6.0
 """Ends this near over ridge belong together at any angle: a sharp bend."""
 FREE_END = 0.5
@@ -43,31 +45,58 @@ class Merge:
     """(m,) whether ridge joins the two ends, whatever their angle."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Arms:
+    """The last stretches of segments, one an end, from the end inwards."""
+
+    points: Float64
+    """(n, k, 2); what is shorter is filled up with its last point."""
+    count: Int64
+    """(n,) how many of the points count."""
+
+    @classmethod
+    def of(cls, segments: tuple[Float64, ...], clear: int) -> _Arms:
+        """Two arms a segment, without the `clear` points at the very end."""
+        arms = [a for s in segments for a in (_arm(s, clear), _arm(s[::-1], clear))]
+        length = ARM - _CLEAR
+        points = np.array([a[np.minimum(np.arange(length), len(a) - 1)] for a in arms])
+        return cls(points, np.array([len(a) for a in arms]))
+
+    def __getitem__(self, ends: Int64) -> _Arms:
+        return _Arms(self.points[ends], self.count[ends])
+
+    @property
+    def counts(self) -> Bool:
+        """(n, k) which points count."""
+        return np.arange(self.points.shape[1]) < self.count[:, None]
+
+    def strength(self, ridges: Ridges) -> Float64:
+        """(n,) the mean ||V|| of each."""
+        values = ridges.sample(self.points.reshape(-1, 2)).reshape(self.counts.shape)
+        return (values * self.counts).sum(1) / self.count
+
+
 @lru_cache(maxsize=4)  # Each view is asked about several times.
 def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
     """Prices every pair of ends within reach: whether one smooth curve runs through both segments,
     over ridge, at one strength."""
-    looks = [
-        [a for s in ridges.segments for a in (_arm(s, clear), _arm(s[::-1], clear))]
-        for clear in (_CLEAR, _HOOKED)
-    ]
-    positions = np.array([a[0] for a in looks[0]])
-    near = np.array([ridges.sample(a).mean() for a in looks[0]])
+    arms = _Arms.of(ridges.segments, _CLEAR)
+    near = arms.strength(ridges)
     # A highlight at a junction fades one arm of a segment, and not the segment.
     whole = np.repeat([np.median(ridges.sample(s)) for s in ridges.segments], 2)
     short = np.repeat([max(1 - len(s) / ARM, 0.0) for s in ridges.segments], 2)
+    positions = arms.points[:, 0]
     pairs = cKDTree(positions).query_pairs(2 * config.gap_px, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
-    cost, touching = np.empty(len(pairs)), np.zeros(len(pairs), bool)
-    for k, (i, j) in enumerate(pairs):
-        distance = float(np.linalg.norm(positions[j] - positions[i]))
-        shape, weakest = _bridge_price(looks[0][i], looks[0][j], ridges, config)
-        if shape > FREE_END and distance < 2 * TOUCHING_PX:
-            shape = min(shape, _bridge_price(looks[1][i], looks[1][j], ridges, config)[0])
-        ratio = min(abs(float(np.log(s[i] / s[j]))) for s in (near, whole))
-        cost[k] = shape + 0.25 * ratio**2 + _SHORT * max(short[i], short[j])
-        touching[k] = distance < TOUCHING_PX and weakest >= config.low
-    return Merge(pairs, cost, touching)
+    i, j = pairs.T
+    distance = np.linalg.norm(positions[j] - positions[i], axis=1)
+    shape, weakest = _bridge_prices(arms, pairs, ridges, config)
+    hooked = np.flatnonzero((shape > FREE_END) & (distance < 2 * TOUCHING_PX))
+    others, _ = _bridge_prices(_Arms.of(ridges.segments, _HOOKED), pairs[hooked], ridges, config)
+    shape[hooked] = np.minimum(shape[hooked], others)
+    ratio = np.minimum(*(abs(np.log(s[i] / s[j])) for s in (near, whole)))
+    cost = shape + 0.25 * ratio**2 + _SHORT * np.maximum(short[i], short[j])
+    return Merge(pairs, cost, (distance < TOUCHING_PX) & (weakest >= config.low))
 
 
 def _arm(segment: Float64, clear: int) -> Float64:
@@ -75,37 +104,59 @@ def _arm(segment: Float64, clear: int) -> Float64:
     return segment[first : first + ARM - _CLEAR]
 
 
+def _bridge_prices(
+    arms: _Arms, pairs: Int64, ridges: Ridges, config: InitializationConfig
+) -> tuple[Float64, Float64]:
+    """What smooth curves through (m, 2) pairs of arms cost by their shape and the ridge below them,
+    and the least ||V|| between the arms, each (m,)."""
+    parts = np.array_split(pairs, len(pairs) // _AT_ONCE + 1)
+    found = [_bridge_price(arms[p[:, 0]], arms[p[:, 1]], ridges, config) for p in parts]
+    price, weakest = zip(*found, strict=True)
+    return np.concatenate(price), np.concatenate(weakest)
+
+
 def _bridge_price(
-    one: Float64, other: Float64, ridges: Ridges, config: InitializationConfig
-) -> tuple[float, float]:
-    """What a smooth curve through two arms costs by its shape and the ridge below it, and the least
-    ||V|| between them."""
-    misfit, swing, bridge = _common_curve(one, other)
-    distance = float(np.linalg.norm(other[0] - one[0]))
+    one: _Arms, other: _Arms, ridges: Ridges, config: InitializationConfig
+) -> tuple[Float64, Float64]:
+    misfit, swing, bridge = _common_curves(one, other)
+    distance = np.linalg.norm(other.points[:, 0] - one.points[:, 0], axis=1)
     seen, weakest = _evidence(ridges, bridge, config)
     missing = (1 - seen) * distance / config.gap_px
     return misfit + _SWING * swing**2 + missing + 0.1 * distance / config.gap_px, weakest
 
 
-def _common_curve(one: Float64, other: Float64) -> tuple[float, float, Float64]:
-    """A cubic through both arms: its mean squared misfit, px^2, by how many radians per length its
-    curvature changes over it, and the cubic between the arms."""
-    distance = float(np.linalg.norm(other[0] - one[0]))
-    t = np.r_[-np.arange(len(one), dtype=float), distance + np.arange(len(other))]
-    scale = max(abs(t).max(), 1.0)
-    design = np.vander(t / scale, 4)
-    points = np.r_[one, other]
-    coefficients, *_ = np.linalg.lstsq(design, points, rcond=None)
-    misfit = float((((design @ coefficients - points) ** 2).sum(1)).mean())
-    swing = 6 * float(np.linalg.norm(coefficients[0])) / scale**3 * float(np.ptp(t)) ** 2
-    between = np.linspace(0, distance, _BRIDGE_SAMPLES) / scale
-    return misfit, swing, np.vander(between, 4) @ coefficients
+def _common_curves(one: _Arms, other: _Arms) -> tuple[Float64, Float64, Float64]:
+    """Cubics through both of m pairs of arms: their mean squared misfits, px^2, by how many radians
+    per length their curvatures change over them, and (m, k, 2) the cubics between the arms."""
+    distance = np.linalg.norm(other.points[:, 0] - one.points[:, 0], axis=1)
+    steps = np.arange(one.points.shape[1], dtype=float)
+    t = np.c_[np.tile(-steps, (len(distance), 1)), distance[:, None] + steps]
+    first, last = 1.0 - one.count, distance + other.count - 1
+    scale = np.maximum(np.maximum(-first, last), 1.0)
+    counts = np.c_[one.counts, other.counts].astype(float)
+    design = _powers(t / scale[:, None])
+    points = np.concatenate([one.points, other.points], axis=1)
+    weighted = (design * counts[..., None]).swapaxes(1, 2)
+    coefficients = np.linalg.solve(weighted @ design, weighted @ points)
+    squared = ((design @ coefficients - points) ** 2).sum(2)
+    misfit = (squared * counts).sum(1) / counts.sum(1)
+    third = np.linalg.norm(coefficients[:, 0], axis=1)
+    swing = 6 * third / scale**3 * (last - first) ** 2
+    between = np.linspace(0, 1, _BRIDGE_SAMPLES) * (distance / scale)[:, None]
+    return misfit, swing, _powers(between) @ coefficients
 
 
-def _evidence(ridges: Ridges, bridge: Float64, config: InitializationConfig) -> tuple[float, float]:
-    """Share of the bridge that is on ridge of its direction, and the least ||V|| on it."""
-    tangents = np.gradient(bridge, axis=0)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    along = search.responses(ridges.field, bridge, tangents)
-    share = float(np.clip(along / config.high, 0, 1).mean())
-    return share, float(ridges.sample(bridge).min())
+def _powers(t: Float64) -> Float64:
+    return np.stack([t**3, t**2, t, np.ones_like(t)], axis=-1)
+
+
+def _evidence(
+    ridges: Ridges, bridges: Float64, config: InitializationConfig
+) -> tuple[Float64, Float64]:
+    """Share of each of (m, k, 2) bridges that is on ridge of its direction, and the least ||V||."""
+    tangents = np.gradient(bridges, axis=1)
+    tangents /= np.maximum(np.linalg.norm(tangents, axis=2, keepdims=True), 1e-9)
+    flat = bridges.reshape(-1, 2)
+    along = search.responses(ridges.field, flat, tangents.reshape(-1, 2))
+    share = np.clip(along.reshape(bridges.shape[:2]) / config.high, 0, 1).mean(1)
+    return share, ridges.sample(flat).reshape(bridges.shape[:2]).min(1)

@@ -97,7 +97,7 @@ def thread_scale(ridges: Ridges, seed: Float64) -> int:
     segment = segments[nearest][max(at - _WIDTH_REACH, 0) : at + _WIDTH_REACH]
     tangents = np.gradient(segment, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    profiles = search.normal_profiles(ridges.field, segment, tangents, _ACROSS, 0.0)
+    profiles = search.normal_profiles(ridges.field, segment, tangents, _ACROSS)
     profile = np.median(profiles, axis=0)
     middle = len(_ACROSS) // 2
     width = (_half_width(profile[middle:]) + _half_width(profile[middle::-1])) / 2
@@ -209,9 +209,11 @@ def _sub_pixel(field: Float32, magnitude: Float32, pixels: Float64) -> Float64:
 
 def _bilinear(magnitude: Float32, pixels: Float64) -> Float64:
     """(k,) values at (k, 2) pixels, 0 outside."""
+    if len(pixels) == 0:
+        return np.empty(0)
     maps = np.asarray(pixels, np.float32).reshape(-1, 1, 2)
     pieces = [
         cv2.remap(magnitude, maps[i : i + _MOST_AT_ONCE], None, cv2.INTER_LINEAR)
-        for i in range(0, max(len(maps), 1), _MOST_AT_ONCE)
+        for i in range(0, len(maps), _MOST_AT_ONCE)
     ]
     return np.concatenate(pieces).ravel().astype(float)
