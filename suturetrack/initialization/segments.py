@@ -97,7 +97,7 @@ def thread_scale(ridges: Ridges, seed: Float64) -> int:
     segment = segments[nearest][max(at - _WIDTH_REACH, 0) : at + _WIDTH_REACH]
     tangents = np.gradient(segment, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    profiles = search.normal_profiles(ridges.field, segment, tangents, _ACROSS)
+    profiles = search.normal_profiles(ridges.field, segment, tangents, _ACROSS, 0.0)
     profile = np.median(profiles, axis=0)
     middle = len(_ACROSS) // 2
     width = (_half_width(profile[middle:]) + _half_width(profile[middle::-1])) / 2
