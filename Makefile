@@ -24,7 +24,7 @@ check: setup
 	$(BIN)/pytest -m 'not long'
 
 test-long: setup
-	$(BIN)/pytest -m long
+	$(BIN)/pytest -m long -o timeout=7200 -o faulthandler_timeout=7500
 
 bench: setup
 	$(BIN)/suturetrack bench segmentation

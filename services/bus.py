@@ -55,8 +55,8 @@ class Transport(Protocol):
     def last(self, pattern: str, timeout: float) -> list[tuple[str, Packet]]:
         """What those who remember give, at once when nobody does."""
 
-    def has_readers(self, key: str) -> bool:
-        """Whether somebody subscribes to the key."""
+    def has_readers(self, key: str, *, large: bool) -> bool:
+        """Whether somebody subscribes to the key, to which such messages will be put."""
 
     def serve(self, pattern: str, deliver: Callable[[str, Packet, Reply], None]) -> None:
         """Calls `deliver(key, question, reply)` from another thread for every question."""
@@ -198,7 +198,7 @@ class Bus:
         number = self._numbers[key]
         self._numbers[key] += 1
         packet = wire.encode(message, self._publisher, number, time.time_ns())
-        self._transport.put(key, packet, large=topic.keep == "newest")
+        self._transport.put(key, packet, large=_is_large(topic))
 
     def make_room(self, example: object) -> None:
         """Prepares for images or fields like this one, so that the first one is not late."""
@@ -250,7 +250,8 @@ class Bus:
     def wait_for_readers(self, topic: Topic[Any], timeout: float | None = None) -> bool:
         """Waits until somebody reads the topic; False after the time-out or when stopped."""
         key = f"{self._root}/{topics.pattern_of(topic)}"
-        return self._wait(lambda: self._transport.has_readers(key), timeout)
+        large = _is_large(topic)
+        return self._wait(lambda: self._transport.has_readers(key, large=large), timeout)
 
     def ask(self, question: Question[Q, A], content: Q, timeout: float) -> A:
         """Asks and waits for the answer.
@@ -348,3 +349,8 @@ class Bus:
             if late or self.stop.wait(_POLL_S):
                 return False
         return True
+
+
+def _is_large(topic: Topic[Any]) -> bool:
+    """Whether messages go through shared memory and give way to all others: images and fields."""
+    return topic.keep == "newest"

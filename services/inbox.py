@@ -18,18 +18,20 @@ class Stop:
     """Tells every waiting loop of a process to end."""
 
     def __init__(self) -> None:
-        self.condition = threading.Condition()
+        # Entered by itself: an interrupt on the way into a Condition would leave it locked.
+        self.lock = threading.RLock()
+        self.condition = threading.Condition(self.lock)
         self.is_set = False
 
     def set(self) -> None:
         """Ends all waiting, now and later; not to be called from a signal handler."""
-        with self.condition:
+        with self.lock:
             self.is_set = True
             self.condition.notify_all()
 
     def wait(self, seconds: float) -> bool:
         """Sleeps, at most until stopped; whether it was stopped."""
-        with self.condition:
+        with self.lock:
             return self.condition.wait_for(lambda: self.is_set, seconds)
 
 
@@ -53,7 +55,7 @@ class Inbox(Generic[T]):
 
     def put(self, item: T) -> None:
         """Adds a message; never waits for the reader."""
-        with self._stop.condition:
+        with self._stop.lock:
             self.received += 1
             if len(self._items) >= self._depth:
                 self._items.popleft()
@@ -64,7 +66,7 @@ class Inbox(Generic[T]):
     def get(self, timeout: float | None = None) -> T | None:
         """The next message; None after `timeout` seconds without one, or when asked to stop."""
         deadline = None if timeout is None else time.monotonic() + timeout
-        with self._stop.condition:
+        with self._stop.lock:
             while not self._items and not self._stop.is_set:
                 left = None if deadline is None else deadline - time.monotonic()
                 if left is not None and left <= 0:

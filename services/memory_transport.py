@@ -63,8 +63,9 @@ class MemoryTransport:
         kept = [k for t in self._others() for p, k in t.remembered if p == pattern]
         return [item for mapping in kept for item in mapping.items()]
 
-    def has_readers(self, key: str) -> bool:
+    def has_readers(self, key: str, *, large: bool) -> bool:
         """See `Transport`."""
+        del large
         return any(_matches(p, key) for t in self._others() for p, _ in t.subscriptions)
 
     def serve(self, pattern: str, deliver: Callable[[str, Packet, Reply], None]) -> None:

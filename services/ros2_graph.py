@@ -34,6 +34,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
+from services.zenoh_session import Session
 from suturetrack.types import InputError
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
@@ -66,14 +67,13 @@ class RosNode:
             raise InputError(f"domain {config.domain}: use ROS_DOMAIN_ID, 0 to {_LARGEST_DOMAIN}")
         self._domain, self._name = config.domain, name
         self._session = _open(config.router)
-        self._kept: list[object] = []
         self._entities = 0
         self._declare(f"{self._prefix(0)}/NN/%/%/{name}")
 
     def publisher(self, topic: str, kind: str) -> RosPublisher:
         """Announces a topic, such as "/a/b", of a type such as "std_msgs/msg/String"."""
         token = self._announce("MP", topic, kind)
-        publisher = self._session.declare_publisher(
+        publisher = self._session.zenoh.declare_publisher(
             _key(self._domain, topic, kind),
             congestion_control=zenoh.CongestionControl.DROP,
             reliability=zenoh.Reliability.RELIABLE,
@@ -96,12 +96,11 @@ class RosNode:
 
         # Any hash: what matters is whether the bytes can be read.
         key = f"{_key(self._domain, topic, kind).rpartition('/')[0]}/*"
-        self._kept.append(self._session.declare_subscriber(key, arrived))
+        self._session.keep(lambda session: session.declare_subscriber(key, arrived))
 
     def close(self) -> None:
         """Leaves the graph; safe to call twice."""
-        if not self._session.is_closed():
-            self._session.close()  # type: ignore[no-untyped-call]
+        self._session.close()
 
     def _announce(self, entity: str, topic: str, kind: str) -> str:
         if not _TOPIC.fullmatch(topic):
@@ -114,10 +113,10 @@ class RosNode:
         return token
 
     def _declare(self, token: str) -> None:
-        self._kept.append(self._session.liveliness().declare_token(token))
+        self._session.keep(lambda session: session.liveliness().declare_token(token))
 
     def _prefix(self, entity: int) -> str:
-        return f"@ros2_lv/{self._domain}/{self._session.info.zid()}/0/{entity}"
+        return f"@ros2_lv/{self._domain}/{self._session.zenoh.info.zid()}/0/{entity}"
 
 
 class RosPublisher:
@@ -170,7 +169,7 @@ def _dds_name(kind: str) -> str:
     return f"{package}::msg::dds_::{name}_"
 
 
-def _open(router: str) -> zenoh.Session:
+def _open(router: str) -> Session:
     zenoh.init_log_from_env_or("error")
     config = zenoh.Config()
     settings = {
@@ -182,7 +181,7 @@ def _open(router: str) -> zenoh.Session:
     try:
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
-        return zenoh.open(config)
+        return Session(config)
     except zenoh.ZError as error:
         raise InputError(
             f"no ROS 2 graph at {router}; start its router (ros2 run rmw_zenoh_cpp rmw_zenohd), or "

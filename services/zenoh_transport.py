@@ -22,6 +22,7 @@ from zenoh.shm import GarbageCollect, ShmProvider, ZShmMut
 
 from services.bus import Deliver, NoAnswer, Reply
 from services.wire import Packet, WireError
+from services.zenoh_session import Session
 from suturetrack.types import InputError
 
 LISTENERS = ("source", "segmenter", "tracker", "run")
@@ -147,12 +148,11 @@ class ZenohTransport:
     def __init__(self, config: zenoh.Config, *, patient: bool = False):
         zenoh.init_log_from_env_or("error")
         try:
-            self._session = zenoh.open(config)
+            self._session = Session(config)
         except zenoh.ZError as error:
             raise InputError(explain(error)) from error
         self._patient = patient
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._kept: list[object] = []
         self._pool: ShmProvider | None = None
         self._pooled_size = 0
 
@@ -176,7 +176,7 @@ class ZenohTransport:
         def arrived(sample: zenoh.Sample) -> None:
             deliver(str(sample.key_expr), _packet(sample))
 
-        self._kept.append(self._session.declare_subscriber(pattern, arrived))
+        self._session.keep(lambda session: session.declare_subscriber(pattern, arrived))
 
     def remember(self, pattern: str, kept: Mapping[str, Packet]) -> None:
         """See `Transport`."""
@@ -187,16 +187,16 @@ class ZenohTransport:
                     if query.key_expr.intersects(zenoh.KeyExpr(key)):
                         _reply(query, key, packet)
 
-        self._kept.append(self._session.declare_queryable(pattern, arrived))
+        self._session.keep(lambda session: session.declare_queryable(pattern, arrived))
 
     def last(self, pattern: str, timeout: float) -> list[tuple[str, Packet]]:
         """See `Transport`."""
-        replies = self._session.get(pattern, timeout=timeout)
+        replies = self._session.zenoh.get(pattern, timeout=timeout)
         return [(str(r.ok.key_expr), _packet(r.ok)) for r in replies if r.ok is not None]
 
-    def has_readers(self, key: str) -> bool:
+    def has_readers(self, key: str, *, large: bool) -> bool:
         """See `Transport`."""
-        status: Any = self._publisher(key, large=True).matching_status  # its stub says bool
+        status: Any = self._publisher(key, large=large).matching_status  # its stub says bool
         return bool(status.matching)
 
     def serve(self, pattern: str, deliver: Callable[[str, Packet, Reply], None]) -> None:
@@ -214,11 +214,11 @@ class ZenohTransport:
 
             deliver(key, _packet(query), reply)
 
-        self._kept.append(self._session.declare_queryable(pattern, arrived))
+        self._session.keep(lambda session: session.declare_queryable(pattern, arrived))
 
     def ask(self, key: str, packet: Packet, timeout: float) -> Packet:
         """See `Transport`."""
-        replies = self._session.get(
+        replies = self._session.zenoh.get(
             key,
             payload=packet.payload,
             encoding=packet.encoding,
@@ -235,7 +235,7 @@ class ZenohTransport:
 
     def declare_alive(self, key: str) -> None:
         """See `Transport`."""
-        self._kept.append(self._session.liveliness().declare_token(key))
+        self._session.keep(lambda session: session.liveliness().declare_token(key))
 
     def watch_alive(self, pattern: str, changed: Callable[[str, bool], None]) -> None:
         """See `Transport`."""
@@ -243,13 +243,13 @@ class ZenohTransport:
         def arrived(sample: zenoh.Sample) -> None:
             changed(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        watcher = self._session.liveliness().declare_subscriber(pattern, arrived, history=True)
-        self._kept.append(watcher)
+        self._session.keep(
+            lambda session: session.liveliness().declare_subscriber(pattern, arrived, history=True)
+        )
 
     def close(self) -> None:
         """See `Transport`."""
-        if not self._session.is_closed():
-            self._session.close()  # type: ignore[no-untyped-call]
+        self._session.close()
 
     def _share(self, payload: bytes) -> bytes | ZShmMut:
         """The payload in shared memory; itself where there is none, or no room in it."""
@@ -266,7 +266,7 @@ class ZenohTransport:
     def _publisher(self, key: str, *, large: bool) -> zenoh.Publisher:
         if key not in self._publishers:
             control, priority = zenoh.CongestionControl, zenoh.Priority
-            self._publishers[key] = self._session.declare_publisher(
+            self._publishers[key] = self._session.zenoh.declare_publisher(
                 key,
                 congestion_control=control.BLOCK if self._patient else control.DROP,
                 priority=priority.DATA if large else priority.INTERACTIVE_HIGH,

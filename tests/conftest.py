@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import faulthandler
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +21,13 @@ settings.register_profile(
     "default", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("default")
+
+_LONGEST_END_S = 60.0
+
+
+def pytest_unconfigure() -> None:
+    """Ends a run that hangs when its tests are done, and says where."""
+    faulthandler.dump_traceback_later(_LONGEST_END_S, exit=True, file=sys.__stderr__)
 
 
 def make_rig(baseline: float = 40.0, metres_per_unit: float = 1e-3) -> StereoRig:

@@ -76,17 +76,19 @@ def consumers() -> Iterator[list[Consumer]]:
     """One that keeps up, a slow one and one that stands still, for frames and for small messages."""
     buses = [Bus(ZenohTransport(local_config("test", n)), "test", n) for n in ("tracker", "viewer")]
     keeping_up, other = buses
-    yield [
-        Consumer(keeping_up.newest(topics.FRAME), 0.0),
-        Consumer(other.newest(topics.FRAME), 0.05),
-        Consumer(other.newest(topics.FRAME), None),
-        Consumer(keeping_up.every(topics.STEP), 0.0),
-        Consumer(other.every(topics.STEP), 0.01),
-        Consumer(other.every(topics.STEP), None),
-    ]
-    for bus in buses:
-        bus.close()
-    remove_sockets("test")
+    try:
+        yield [
+            Consumer(keeping_up.newest(topics.FRAME), 0.0),
+            Consumer(other.newest(topics.FRAME), 0.05),
+            Consumer(other.newest(topics.FRAME), None),
+            Consumer(keeping_up.every(topics.STEP), 0.0),
+            Consumer(other.every(topics.STEP), 0.01),
+            Consumer(other.every(topics.STEP), None),
+        ]
+    finally:
+        for bus in buses:
+            bus.close()
+        remove_sockets("test")
 
 
 @pytest.mark.parametrize("flood", [600, pytest.param(20_000, marks=pytest.mark.long)])
