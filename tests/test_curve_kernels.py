@@ -6,7 +6,7 @@ from hypothesis.extra import numpy as hnp
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import search, spline
+from suturetrack.kernels import rows, search, spline
 from tests.reference import curve_fit as reference
 from tests.reference import strands as strands_reference
 
@@ -56,6 +56,52 @@ def test_a_band_that_is_not_positive_definite_is_told() -> None:
     band = np.zeros((6, spline.BANDWIDTH))
     band[:, 0] = [1, 1, -1, 1, 1, 1]
     assert not spline.factorize(band)
+
+
+def test_samples_are_even_within_each_span() -> None:
+    s, share = spline.even_samples(KNOTS, 4)
+    edges = np.unique(KNOTS)
+    spans = zip(edges[:-1], edges[1:], s.reshape(-1, 4), share.reshape(-1, 4), strict=True)
+    for start, stop, inner, parts in spans:
+        np.testing.assert_allclose(inner, start + (stop - start) * (np.arange(4) + 0.5) / 4)
+        np.testing.assert_allclose(parts, (stop - start) / 4)
+
+
+def test_the_length_is_the_integral_of_the_speed() -> None:
+    control = RNG.normal(size=(9, 3))
+    curve = nurbs.curve_from(3, KNOTS, control)
+    dense = nurbs.evaluate(curve, np.linspace(0, 1, 100_001))
+    expected = np.linalg.norm(np.diff(dense, axis=0), axis=1).sum()
+    assert spline.arc_length(KNOTS, control) == pytest.approx(expected, rel=1e-2)
+    edges = np.unique(KNOTS)
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    half = np.diff(edges)[:, None] / 2
+    s = edges[:-1, None] + half * (1 + nodes)
+    slope = reference.design(s.ravel(), KNOTS, 1) @ control
+    by_rule = (np.linalg.norm(slope, axis=1) * (half * weights).ravel()).sum()
+    assert spline.arc_length(KNOTS, control) == pytest.approx(by_rule, rel=1e-12)
+
+
+def test_rows_are_those_of_stacked_matrices() -> None:
+    jacobians = RNG.normal(size=(2, 30, 2, 3))
+    goal, first = RNG.normal(size=(2, 30, 3))
+    tangents = RNG.normal(size=(30, 2))
+    weights, others = RNG.uniform(0, 2, (2, 30)) * (RNG.random((2, 30)) > 0.3)
+    offset = RNG.normal(size=30)
+    both = jacobians[0], jacobians[1]
+    information, pull = rows.held_rows(both, goal, weights, others)
+    expected = reference.held_rows(both, goal, weights, others)
+    np.testing.assert_allclose(information, expected[0], atol=1e-12)
+    np.testing.assert_allclose(pull, expected[1], atol=1e-12)
+    rows.add_measured_rows(tangents, jacobians[0], others, offset, information, pull)
+    measured = reference.measured_rows(tangents, jacobians[0], others, offset)
+    np.testing.assert_allclose(information, expected[0] + measured[0], atol=1e-12)
+    np.testing.assert_allclose(pull, expected[1] + measured[1], atol=1e-12)
+    shape = rows.shape_rows(first, goal, weights, others)
+    for found, wanted in zip(
+        shape, reference.shape_rows(first, goal, weights, others), strict=True
+    ):
+        np.testing.assert_allclose(found, wanted, atol=1e-12)
 
 
 @given(st.floats(-1, 12), st.floats(-1, 9), st.floats(0, 2 * np.pi))
@@ -144,6 +190,38 @@ def test_strands_are_kept_apart_as_their_twins_do(seed: int) -> None:
         search.covered(own[0], own[1], offsets, other[0], 3.0),
         strands_reference.covered(own[0], own[1], offsets, other[0], 3.0),
     )
+
+
+@given(st.integers(0, 10_000), st.sampled_from([(5.0, 0.4), (3.0, 0.0), (6.25, 0.4)]))
+def test_the_line_beside_a_strand_is_that_of_its_twin(seed: int, how: tuple[float, float]) -> None:
+    rng = np.random.default_rng(seed)
+    own, other = random_strand(rng, 40), random_strand(rng, 55)
+    # A ridge beside the strand, on noise.
+    v, u = np.mgrid[:45, :64]
+    middle = np.interp(u[0], own[0][:, 0], own[0][:, 1] + rng.uniform(-3, 3))
+    field = rng.normal(0, 0.05, (45, 64, 2))
+    field[..., 0] += np.exp(-0.5 * ((v - middle) / 1.5) ** 2)
+    lengths, level = np.full(40, 1.5), rng.uniform(0.5, 1.0, 40)
+    arguments = (field.astype(np.float32), own, other, 25.0, lengths, level)
+    reach, leniency = how
+    line = search.best_line(*arguments, reach, 0.5, leniency)
+    for found, wanted in zip(
+        line, reference.best_line(*arguments, reach, 0.5, leniency), strict=True
+    ):
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_the_line_lies_where_the_ridge_is_within_the_image() -> None:
+    along = np.arange(0.0, 64.0)
+    own = np.c_[along, np.full(64, 20.0)], np.tile([1.0, 0.0], (64, 1)), along
+    field = np.zeros((45, 64, 2), np.float32)
+    field[..., 0] = np.exp(-0.5 * ((np.arange(45) - 21.3) / 1.5) ** 2)[:, None]
+    one = np.ones(64)
+    offset, response, found = search.best_line(field, own, own, 45.0, one, one, 5.0, 0.5, 0.4)
+    np.testing.assert_array_equal(found, (along >= 1) & (along <= 62))
+    np.testing.assert_allclose(offset[found], 1.3, atol=0.1)
+    assert (response[found] > 0.9).all()
+    assert not offset[~found].any()
 
 
 def test_a_place_belongs_to_the_strand_that_is_nearest() -> None:

@@ -16,6 +16,10 @@ _CLAIM_PX, APART_PX = 4.0, 2.0
 _BLOCK = 8
 # Cosine of the angle up to which two strands may be mistaken for one another.
 _PARALLEL = 0.8
+# The line along a thread: its price of roughness, by squared px, its largest step from sample to sample
+# and the half width of a peak in places, its least response and its shortest run.
+_ROUGHNESS, _REACH, _PEAK_HALF = 0.2, 4, 3
+_LEAST_RESPONSE, _SHORTEST_RUN_PX = 0.2, 10.0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -292,6 +296,62 @@ def doubled(
                 parallel = abs(tu * other_tangents[q, 0] + tv * other_tangents[q, 1])
                 out[j] |= abs(dv * tu - du * tv) < near and parallel > _PARALLEL
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def best_line(
+    field: Float32,
+    strand: tuple[Float64, Float64, Float64],
+    others: tuple[Float64, Float64, Float64],
+    apart: float,
+    lengths: Float64,
+    level: Float64,
+    reach: float,
+    step: float,
+    leniency: float,
+) -> tuple[Float64, Float64, Bool]:
+    """The thread beside its samples, as one continuous line.
+
+    Args:
+        field: (H, W, 2).
+        strand, others, apart: of `claimed`; what belongs to others is not taken.
+        lengths: (k,) px of the curve that each sample stands for.
+        level: (k,) response of a clear view of the thread.
+        reach, step: px to each side of a sample, and from one place to the next.
+        leniency: of `normal_profiles`.
+
+    Returns:
+        (k,) px along the normal, 0 where nothing was found; (k,) responses there; (k,) whether the
+        thread was found.
+    """
+    pixels, tangents, _ = strand
+    half = int(np.round(reach / step))
+    places = step * np.arange(-half, half + 1)
+    profiles = normal_profiles(field, pixels, tangents, places, leniency)
+    taken = claimed(strand, others, places, apart)
+    gain = np.empty_like(profiles)
+    for j in range(len(pixels)):
+        for i in range(len(places)):
+            clear = 0.0 if taken[j, i] else min(profiles[j, i] / level[j], 1.0)
+            away = places[i] / reach
+            gain[j, i] = clear - 0.1 * (away * away)
+    path = best_path(gain, _ROUGHNESS * step**2, _REACH)
+    offset, response = peaks(profiles, path, _PEAK_HALF)
+    found = np.zeros(len(pixels), np.bool_)
+    for j in range(len(pixels)):
+        if np.isfinite(offset[j]) and response[j] > _LEAST_RESPONSE * level[j]:
+            is_taken = taken[j, int(np.round(offset[j]))]
+            found[j] = _is_inside(field, pixels[j]) and not is_taken
+        offset[j] = (offset[j] - half) * step
+    found = solid(found, lengths, _SHORTEST_RUN_PX)
+    return np.where(found, offset, 0.0), response, found
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_inside(field: Float32, pixel: Float64) -> bool:
+    """Whether a pixel lies within the image, and not on its border."""
+    height, width = field.shape[0], field.shape[1]
+    return 1 <= pixel[0] <= width - 2 and 1 <= pixel[1] <= height - 2
 
 
 @numba.njit(cache=True, nogil=True)

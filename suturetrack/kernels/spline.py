@@ -12,6 +12,7 @@ Int64 = NDArray[np.int64]
 
 DEGREE = 3
 ORDER = DEGREE + 1
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 BANDWIDTH = 3 * ORDER
 """Entries on and below the diagonal of the normal equations of a cubic curve in 3-D."""
 
@@ -83,6 +84,40 @@ def combine(first: Int64, values: Float64, control_points: Float64) -> Float64:
                 total += values[j, i] * control_points[first[j] + i, a]
             points[j, a] = total
     return points
+
+
+@numba.njit(cache=True, nogil=True)
+def even_samples(knots: Float64, count: int) -> tuple[Float64, Float64]:
+    """`count` parameters evenly within each knot span, clear of the knots, and their shares of [0, 1]."""
+    spans = 0
+    for i in range(len(knots) - 1):
+        spans += knots[i + 1] > knots[i]
+    s, share = np.empty(spans * count), np.empty(spans * count)
+    k = 0
+    for i in range(len(knots) - 1):
+        if knots[i + 1] > knots[i]:
+            width = (knots[i + 1] - knots[i]) / count
+            for j in range(count):
+                s[k], share[k] = knots[i] + width * (j + 0.5), width
+                k += 1
+    return s, share
+
+
+@numba.njit(cache=True, nogil=True)
+def arc_length(knots: Float64, control_points: Float64) -> float:
+    """Length of a cubic curve of (n + 1, 3) control points, by Gauss's rule of four on each span."""
+    s, share = even_samples(knots, len(_NODES))
+    for k in range(0, len(s), len(_NODES)):
+        half = share[k] * len(_NODES) / 2
+        start = s[k] - share[k] / 2
+        for i in range(len(_NODES)):
+            s[k + i], share[k + i] = start + half * (1 + _NODES[i]), half * _WEIGHTS[i]
+    first, table = local_basis(s, knots)
+    slope = combine(first, table[1], control_points)
+    total = 0.0
+    for k in range(len(s)):
+        total += share[k] * np.sqrt(slope[k, 0] ** 2 + slope[k, 1] ** 2 + slope[k, 2] ** 2)
+    return total
 
 
 @numba.njit(cache=True, nogil=True)

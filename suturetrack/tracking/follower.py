@@ -122,14 +122,15 @@ class Follower:
         """The thread in the next field; `neighbours` are the strands of other threads."""
         model = self.model
         seconds = (field.stamp.capture_ns - model.capture_ns) * _NS
-        before = model.curve
+        before, predicted = model.curve, model.motion.predict(model.curve, seconds)
         model.capture_ns = field.stamp.capture_ns
         if self.config.method == "paper":
             evidence, inserted, removed = self._follow_by_forces(field, neighbours)
         else:
-            evidence, inserted, removed = self._follow_by_least_squares(field, seconds, neighbours)
-        seen = self._seen = evidence.evenly()[1]
-        predicted = model.motion.predict(before, seconds)
+            evidence, inserted, removed = self._follow_by_least_squares(
+                field, predicted, neighbours
+            )
+        seen = self._seen = evidence.evenly_seen
         self._doubt.grow(before, predicted, model.curve, seen, self.rig)
         if self.config.method != "paper":
             told = seen & evidence.alone
@@ -259,10 +260,9 @@ class Follower:
         return Evidence.of(fit), inserted, removed
 
     def _follow_by_least_squares(
-        self, field: RidgeField, seconds: float, neighbours: Neighbours
+        self, field: RidgeField, predicted: Nurbs, neighbours: Neighbours
     ) -> tuple[Evidence, int, int]:
         model = self.model
-        predicted = model.motion.predict(model.curve, seconds)
         best = self._search(predicted, field, neighbours)
         model.curve = best.fit.curve
         if best.share > 0.3:
@@ -325,7 +325,7 @@ class Follower:
         self, field: RidgeField, thread: str, evidence: Evidence, status: Status, events: list[str]
     ) -> ThreadState:
         model = self.model
-        sigma, seen = evidence.evenly()
+        sigma = evidence.sigma
         depth = values_at(model.curve, np.linspace(0, 1, len(sigma)))[:, 2]
         cutoffs = model.levels[0] / 2, model.levels[1] / 2
         return ThreadState(
@@ -336,14 +336,14 @@ class Follower:
             length=length_of(model.curve),
             energies=energies(model.curve, field, self.rig, cutoffs),
             sigma=np.hypot(sigma, self._doubt.px * depth / self.rig.focal),
-            seen=seen,
+            seen=evidence.evenly_seen,
             events=tuple(events),
         )
 
 
 def _noise(evidence: Evidence) -> float:
     """What noise in depth makes of a length."""
-    return _NOISE_SIGMAS * float(np.median(evidence.evenly()[0]))
+    return _NOISE_SIGMAS * float(np.median(evidence.sigma))
 
 
 def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import search, spline
+from suturetrack.kernels import rows, search, spline
 from suturetrack.nurbs import curve_from
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.crowding import crowded
@@ -25,12 +25,7 @@ from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField
 _STEP_PX = 0.5
 # Offsets measured closer than this along the thread share their noise: the filter smears it.
 _CORRELATION_PX = 4.0
-_PEAK_HALF_PX = 1.5
-_ROUGHNESS = 0.2
-_LEAST_RESPONSE = 0.2
 _REFINED_PX = 3.0
-# A shorter run of samples that look like thread is chance.
-_SHORTEST_RUN_PX = 10.0
 _OUTLIER_PX = 1.0
 _HIDDEN_DRIFT_PX = 3.0
 # What a measurement is worth where another ridge draws it aside, and what the prediction is, there
@@ -79,31 +74,17 @@ def search_normals(
     share: Float64,
     level: Float64,
     reach_px: float,
-    size: tuple[int, int],
     neighbours: Strand,
 ) -> Offsets:
     """Looks for the thread along the normals of the samples, as one continuous line.
 
     What lies nearer to another strand of it, or to one of the `neighbours`, is theirs.
     """
-    half = round(reach_px / _STEP_PX)
-    grid = _STEP_PX * np.arange(-half, half + 1)
-    leniency = _LENIENCY if reach_px > _REFINED_PX else 0.0
-    profiles = search.normal_profiles(image, view.pixels, view.tangents, grid, leniency)
     strand = Strand.of(view, share)
-    taken = search.claimed(strand.arrays, strand.joined(neighbours).arrays, grid, SAME_STRAND_PX)
-    gain = (
-        np.where(taken, 0.0, np.minimum(profiles / level[:, None], 1.0))
-        - 0.1 * (grid / reach_px) ** 2
-    )
-    path = search.best_path(gain, _ROUGHNESS * _STEP_PX**2, 4)
-    position, response = search.peaks(profiles, path, round(_PEAK_HALF_PX / _STEP_PX))
-    offset = (position - half) * _STEP_PX
-    found = np.isfinite(position) & (response > _LEAST_RESPONSE * level) & view.inside(size)
-    nearest = np.where(found, np.round(position), 0).astype(int)
-    found &= ~taken[np.arange(len(taken)), nearest]
-    found = search.solid(found, view.speed * share, _SHORTEST_RUN_PX)
-    return Offsets(np.where(found, offset, 0.0), response, found)
+    every = strand.joined(neighbours)
+    leniency = _LENIENCY if reach_px > _REFINED_PX else 0.0
+    how = SAME_STRAND_PX, view.speed * share, level, reach_px, _STEP_PX, leniency
+    return Offsets(*search.best_line(image, strand.arrays, every.arrays, *how))
 
 
 def fit(
@@ -236,12 +217,15 @@ class _Linearized:
         )
         self.views = views(rig, self.points, self.first)
         left, right = (
-            search_normals(image, view, samples.share, level, reach_px, rig.image_size, others)
+            search_normals(image, view, samples.share, level, reach_px, others)
             for image, view, level, others in zip(
                 (field.left, field.right), self.views, levels, neighbours, strict=True
             )
         )
         self.offsets = left, right
+        self._hidden = ~(left.found | right.found)
+        self._amounts = [view.speed * samples.share / _CORRELATION_PX for view in self.views]
+        self._per_unit = np.maximum(_norm(self.views[0].jacobian[:, 1]), 1e-12)
 
     def equations(
         self,
@@ -254,58 +238,50 @@ class _Linearized:
     ) -> _Equations:
         """The normal equations of the next step."""
         equations = _Equations(int(self.samples.first[-1]) + spline.ORDER)
-        self._add_prediction(equations, reference, config)
-        self._add_hold(equations, reference, crowd, surprise)
-        self._add_shape(equations, reference, config)
-        worth = np.where(crowd, _CROWDED_WORTH, 1.0)
-        for view, found, level in zip(self.views, self.offsets, levels, strict=True):
-            weight = worth * self._amount(view) / config.noise_px**2
-            weight = weight * found.found * np.clip(found.response / level, 0, 1) ** 2
-            weight = weight / (1 + (found.offset / outlier_px) ** 2) ** 2
-            row = (view.normals[:, None, :] @ view.jacobian)[:, 0, :]
-            equations.add_scalar(self.samples, 0, row, weight, found.offset)
+        information, pull = self._past(reference, config, crowd, surprise)
+        worth = np.where(crowd, _CROWDED_WORTH, 1.0) / config.noise_px**2
+        for view, amount, found, level in zip(
+            self.views, self._amounts, self.offsets, levels, strict=True
+        ):
+            weight = worth * amount * found.found * np.minimum(found.response / level, 1) ** 2
+            weight /= (1 + (found.offset / outlier_px) ** 2) ** 2
+            rows.add_measured_rows(
+                view.tangents, view.jacobian, weight, found.offset, information, pull
+            )
+        equations.add(self.samples, 0, information, pull)
+        equations.add(self.samples, 2, *self._shape(reference, config))
         return equations
 
-    def _add_prediction(
-        self, equations: _Equations, reference: _Reference, config: TrackingConfig
-    ) -> None:
-        """The drift is one of pixels, so that the past holds depth no tighter than the images do."""
-        weight = self._amount(self.views[0]) / config.drift_px**2 / 2
-        left, right = (view.jacobian.transpose(0, 2, 1) @ view.jacobian for view in self.views)
-        information = weight[:, None, None] * (left + right)
-        away = (reference.points - self.points)[:, :, None]
-        equations.add(self.samples, 0, information, (information @ away)[:, :, 0])
+    def _past(
+        self, reference: _Reference, config: TrackingConfig, crowd: Bool, surprise: Float64
+    ) -> tuple[Float64, Float64]:
+        """The prediction.
 
-    def _add_hold(
-        self, equations: _Equations, reference: _Reference, crowd: Bool, surprise: Float64
-    ) -> None:
-        """Where the thread is hidden or not alone, the past holds it in depth as well."""
-        firmness = self._hidden / _HIDDEN_DRIFT_PX**2
-        firmness = firmness + _CROWDED_HOLD * crowd / surprise**2
-        held: Float64 = firmness * self._amount(self.views[0]) / self._pixel**2
-        away = reference.points - self.points
-        equations.add(self.samples, 0, held[:, None, None] * np.eye(3), held[:, None] * away)
+        The drift is one of pixels, so that the past holds depth no tighter than the images do. Only
+        where the thread is hidden or not alone, it holds it in depth as well.
+        """
+        jacobians = self.views[0].jacobian, self.views[1].jacobian
+        firmness = self._hidden / _HIDDEN_DRIFT_PX**2 + _CROWDED_HOLD * crowd / surprise**2
+        drift = self._amounts[0] / config.drift_px**2 / 2
+        held = firmness * self._amounts[0] * self._per_unit**2
+        return rows.held_rows(jacobians, reference.points - self.points, drift, held)
 
-    def _add_shape(
-        self, equations: _Equations, reference: _Reference, config: TrackingConfig
-    ) -> None:
+    def _shape(self, reference: _Reference, config: TrackingConfig) -> tuple[Float64, Float64]:
         """Little bending, and an even speed along the curve: f'' across and along the tangent.
 
         Where the thread is hidden it keeps the bends that it had. No length is asked for: noise in
         depth only ever adds to the length, and a goal taken from the curve would keep what it adds.
         """
         speed = reference.speed
-        tangent = self.first / _norm(self.first)[:, None]
-        along = tangent[:, :, None] * tangent[:, None, :]
-        bending = config.smoothing * self._pixel * self.samples.share / speed**3
-        stretch = self._amount(self.views[0]) / (config.stretch * speed) ** 2 / _EVEN**2
+        bending = config.smoothing * self.samples.share / (self._per_unit * speed**3)
+        stretch = self._amounts[0] / (config.stretch * speed) ** 2 / _EVEN**2
         goal = np.where(self._hidden[:, None], reference.second, 0.0) - self.second
-        information = bending[:, None, None] * np.eye(3) + stretch[:, None, None] * along
-        pull = (information @ goal[:, :, None])[:, :, 0]
-        equations.add(self.samples, 2, information, pull)
+        return rows.shape_rows(self.first, goal, bending, stretch)
 
     def surprise(self, crowd: Bool) -> Float64:
         """(k,) px by which the thread has left the curve where it is alone, and so in between."""
+        if not crowd.any():
+            return np.ones(len(crowd))
         left, right = (np.where(crowd, 0.0, np.abs(found.offset)) for found in self.offsets)
         away, either, s = np.maximum(left, right), ~(crowd | self._hidden), self.samples.s
         if not either.any():
@@ -314,20 +290,6 @@ class _Linearized:
         smooth = np.convolve(padded, np.full(_SMOOTH, 1 / _SMOOTH), "valid")
         return np.asarray(_LEAST_SURPRISE_PX + np.interp(s, s[either], smooth))
 
-    def _amount(self, view: View) -> Float64:
-        """(k,) how many independent measurements each sample stands for."""
-        return view.speed * self.samples.share / _CORRELATION_PX
-
-    @property
-    def _hidden(self) -> Bool:
-        """(k,) samples that neither image shows."""
-        return ~(self.offsets[0].found | self.offsets[1].found)
-
-    @property
-    def _pixel(self) -> Float64:
-        """(k,) length of a pixel at each sample's depth."""
-        return 1 / np.maximum(np.linalg.norm(self.views[0].jacobian[:, 1], axis=1), 1e-12)
-
 
 class _Equations:
     """Normal equations of one step of the control points."""
@@ -335,13 +297,6 @@ class _Equations:
     def __init__(self, count: int) -> None:
         self.band = np.zeros((3 * count, spline.BANDWIDTH))
         self.gradient = np.zeros(3 * count)
-
-    def add_scalar(
-        self, samples: Samples, times: int, row: Float64, weight: Float64, goal: Float64
-    ) -> None:
-        """Rows row . d = goal, d the change of the samples or of a derivative."""
-        weighted = weight[:, None] * row
-        self.add(samples, times, weighted[:, :, None] * row[:, None, :], weighted * goal[:, None])
 
     def solve(self) -> Float64:
         """(n + 1, 3) step; leaves the factor in the band."""
@@ -360,7 +315,8 @@ class _Equations:
 
 
 def _norm(vectors: Float64) -> Float64:
-    return np.maximum(np.linalg.norm(vectors, axis=1), np.finfo(float).tiny)
+    squared = np.einsum("ij,ij->i", vectors, vectors)
+    return np.asarray(np.maximum(np.sqrt(squared), np.finfo(float).tiny))
 
 
 def _residual(pixels: Sequence[Float64], linear: _Linearized) -> Float64:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
+from suturetrack.kernels.search import Int64
 from suturetrack.tracking.gauss_newton import Fit
 from suturetrack.tracking.sampling import View, values_at, views
 from suturetrack.tracking.strands import SAME_STRAND_PX, Neighbours, Strand
 from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField, Status
 
 RELIABILITY_SAMPLES = 64
+_EVENLY = np.linspace(0, 1, RELIABILITY_SAMPLES)
 _NEAR_PX = 1.5
 _BESIDE_PX, _NOT_OWN_PX = np.arange(-30.0, 30.1, 1.5), 6.0
 _NEXT_PX, _NOT_TAKEN_PX = np.arange(-10.0, 10.1, 1.0), 3.0
@@ -49,13 +52,18 @@ class Evidence:
         seen = left.found & right.found & near
         return cls(fit, seen, float(np.sum(fit.samples.share * seen)))
 
-    def evenly(self) -> tuple[Float64, Bool]:
-        """Standard deviation, and whether seen, at evenly spaced parameters."""
-        s, at = self.fit.samples.s, np.linspace(0, 1, RELIABILITY_SAMPLES)
-        sigma = np.sqrt(np.trace(self.fit.covariance, axis1=1, axis2=2))
-        return np.interp(at, s, sigma), self._even(self.seen)
+    @cached_property
+    def sigma(self) -> Float64:
+        """(K,) standard deviation of the position, at evenly spaced parameters."""
+        variance = np.trace(self.fit.covariance, axis1=1, axis2=2)
+        return np.interp(_EVENLY, self.fit.samples.s, np.sqrt(variance))
 
-    @property
+    @cached_property
+    def evenly_seen(self) -> Bool:
+        """(K,) whether seen, at evenly spaced parameters."""
+        return self._even(self.seen)
+
+    @cached_property
     def alone(self) -> Bool:
         """(k,) whether no other ridge runs close beside the thread, at evenly spaced parameters."""
         return ~self._even(self.fit.crowded)
@@ -91,8 +99,12 @@ class Evidence:
         return self._even(unseen | left_alone), self._even(plain)
 
     def _even(self, flags: Bool) -> Bool:
-        s, at = self.fit.samples.s, np.linspace(0, 1, RELIABILITY_SAMPLES)
-        return flags[np.clip(np.searchsorted(s, at), 0, len(s) - 1)]
+        return flags[self._nearest]
+
+    @cached_property
+    def _nearest(self) -> Int64:
+        s = self.fit.samples.s
+        return np.clip(np.searchsorted(s, _EVENLY), 0, len(s) - 1)
 
 
 def _beside(
@@ -128,7 +140,7 @@ class Doubt:
         self, before: Nurbs, predicted: Nurbs, after: Nurbs, seen: Bool, rig: StereoRig
     ) -> None:
         """One field later, in which the curve moved from `before` to `after`."""
-        s = np.linspace(0, 1, RELIABILITY_SAMPLES)
+        s = _EVENLY
         curves = before, predicted, after
         places = [rig.project(values_at(curve, s))[0] for curve in curves]
         both = views(rig, values_at(after, s), values_at(after, s, 1))

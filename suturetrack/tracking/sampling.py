@@ -10,8 +10,6 @@ from suturetrack.camera import StereoRig
 from suturetrack.kernels import spline
 from suturetrack.types import Bool, Float64, Nurbs
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
-
 
 @dataclass(frozen=True, eq=False)
 class Samples:
@@ -29,10 +27,8 @@ class Samples:
     @classmethod
     def of(cls, knots: Float64, per_span: int) -> Samples:
         """`per_span` samples in each knot span, evenly, clear of the knots."""
-        edges = distinct(knots)
-        width = np.diff(edges)[:, None] / per_span
-        s = (edges[:-1, None] + width * (np.arange(per_span) + 0.5)).ravel()
-        return cls(s, np.repeat(width, per_span), *spline.local_basis(s, knots))
+        s, share = spline.even_samples(knots, per_span)
+        return cls(s, share, *spline.local_basis(s, knots))
 
     @classmethod
     def at(cls, knots: Float64, s: Float64) -> Samples:
@@ -88,14 +84,11 @@ def values_at(curve: Nurbs, s: Float64, times: int = 0) -> Float64:
 
 def length_of(curve: Nurbs) -> float:
     """Arc length of a cubic curve, by quadrature on each knot span."""
-    edges = distinct(curve.knots)
-    half = np.diff(edges)[:, None] / 2
-    speed = np.linalg.norm(
-        values_at(curve, (edges[:-1, None] + half * (1 + _NODES)).ravel(), 1), axis=1
-    )
-    return float(np.sum(speed * (half * _WEIGHTS).ravel()))
+    return float(spline.arc_length(curve.knots, curve.control_points))
 
 
 def distinct(knots: Float64) -> Float64:
     """The sorted knots, each once."""
-    return knots[np.r_[True, np.diff(knots) > 0]]
+    is_new = np.ones(len(knots), bool)
+    np.greater(knots[1:], knots[:-1], out=is_new[1:])
+    return knots[is_new]

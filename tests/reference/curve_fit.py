@@ -7,6 +7,9 @@ import itertools
 import numpy as np
 from scipy.interpolate import BSpline
 
+from suturetrack.kernels import search
+from tests.reference import strands
+
 
 def design(s: np.ndarray, knots: np.ndarray, times: int = 0) -> np.ndarray:
     """(k, n + 1) cubic basis functions or their derivatives."""
@@ -51,3 +54,64 @@ def best_path(gain: np.ndarray, stiffness: float, reach: int) -> float:
             value = gain[np.arange(count), list(path)].sum() - stiffness * (steps**2).sum()
             best = max(best, float(value))
     return best
+
+
+def best_line(
+    field: np.ndarray,
+    strand: strands.Strand,
+    others: strands.Strand,
+    apart: float,
+    lengths: np.ndarray,
+    level: np.ndarray,
+    reach: float,
+    step: float,
+    leniency: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offsets, responses, and whether the thread was found; see `kernels.search.best_line`."""
+    pixels, tangents, _ = strand
+    half = round(reach / step)
+    places = np.asarray(step * np.arange(-half, half + 1), np.float64)
+    profiles = search.normal_profiles(field, pixels, tangents, places, leniency)
+    taken = strands.claimed(strand, others, places, apart)
+    clear = np.where(taken, 0.0, np.minimum(profiles / level[:, None], 1.0))
+    path = search.best_path(clear - 0.1 * (places / reach) ** 2, 0.2 * step**2, 4)
+    position, response = search.peaks(profiles, path, 3)
+    height, width, _ = field.shape
+    inside = ((pixels >= 1) & (pixels <= (width - 2, height - 2))).all(axis=1)
+    found = np.isfinite(position) & (response > 0.2 * level) & inside
+    nearest = np.where(found, np.round(position), 0).astype(int)
+    found &= ~taken[np.arange(len(taken)), nearest]
+    found = search.solid(found, lengths, 10.0)
+    return np.where(found, (position - half) * step, 0.0), response, found
+
+
+def held_rows(
+    jacobians: tuple[np.ndarray, np.ndarray],
+    goal: np.ndarray,
+    by_pixels: np.ndarray,
+    in_space: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Information and pull; see `kernels.rows.held_rows`."""
+    left, right = (j.transpose(0, 2, 1) @ j for j in jacobians)
+    information = by_pixels[:, None, None] * (left + right) + in_space[:, None, None] * np.eye(3)
+    return information, (information @ goal[:, :, None])[:, :, 0]
+
+
+def measured_rows(
+    tangents: np.ndarray, jacobian: np.ndarray, weight: np.ndarray, offset: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What `kernels.rows.add_measured_rows` adds to information and pull."""
+    normals = np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
+    row = (normals[:, None, :] @ jacobian)[:, 0, :]
+    weighted = weight[:, None] * row
+    return weighted[:, :, None] * row[:, None, :], weighted * offset[:, None]
+
+
+def shape_rows(
+    first: np.ndarray, goal: np.ndarray, bending: np.ndarray, stretch: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Information and pull; see `kernels.rows.shape_rows`."""
+    tangent = first / np.linalg.norm(first, axis=1, keepdims=True)
+    along = tangent[:, :, None] * tangent[:, None, :]
+    information = bending[:, None, None] * np.eye(3) + stretch[:, None, None] * along
+    return information, (information @ goal[:, :, None])[:, :, 0]
