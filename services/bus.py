@@ -77,7 +77,8 @@ class Transport(Protocol):
 class Reader(Generic[T]):
     """A subscription; iterating gives valid messages and ends when the process is asked to stop.
 
-    What was sent equals what was read plus `passed_over`, `lost`, `refused` and what still waits.
+    What was sent, from the first to the last message that arrived of each publisher, equals what was read
+    plus `passed_over`, `lost`, `refused` and what still waits.
     """
 
     def __init__(self, bus: Bus, topic: Topic[T], depth: int):
@@ -248,7 +249,7 @@ class Bus:
         return found
 
     def wait_for_readers(self, topic: Topic[Any], timeout: float | None = None) -> bool:
-        """Waits until somebody reads the topic; False after the time-out or when stopped."""
+        """Waits for the first reader of a topic; False after the time-out or when stopped."""
         key = f"{self._root}/{topics.pattern_of(topic)}"
         large = _is_large(topic)
         return self._wait(lambda: self._transport.has_readers(key, large=large), timeout)

@@ -40,11 +40,13 @@ def make_rig(baseline: float = 40.0, metres_per_unit: float = 1e-3) -> StereoRig
     )
 
 
-def wait_until(condition: Callable[[], object], seconds: float = 30.0) -> None:
-    """Returns as soon as the condition holds; fails when it does not in time."""
+def wait_until(
+    condition: Callable[[], object], seconds: float = 30.0, tell: Callable[[], str] = lambda: ""
+) -> None:
+    """Returns as soon as the condition holds; fails when it does not in time, and tells of it."""
     deadline = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
+        assert time.monotonic() < deadline, f"waited in vain {tell()}"
         time.sleep(0.005)
 
 
