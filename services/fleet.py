@@ -24,6 +24,12 @@ _POLL_S = 0.01
 _STOPPED = (-signal.SIGTERM,)
 """Statuses of a process that was stopped before it could say goodbye."""
 _SET_CHILD_SUBREAPER = 36
+_LOADING_S = 300.0
+"""Until a nursery that still loads and compiles counts as hung."""
+_BIRTH_S = 5.0
+"""Until one that has loaded counts as hung, when it is asked for a process."""
+_PAUSE_S = 1.0
+"""Between two looks until it was the one who looks that stood still."""
 _MEMORY_S = 60.0
 """Deaths longer ago count neither towards the budget nor for the back-off."""
 _BACK_OFF_S = 0.5
@@ -48,7 +54,8 @@ class Nursery:
     def __init__(self) -> None:
         # Makes the forked ones children of this process.
         ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
-        self._begin()
+        self._looked = time.monotonic()
+        self._desk, self._process = self._begin()
 
     def bear(self, launch: Launch) -> IO[str]:
         """Has a process started; what it says."""
@@ -56,12 +63,29 @@ class Nursery:
         said, told = os.pipe()
         if self._process.poll() is not None:
             self._desk.close()
-            self._begin()
+            self._desk, self._process = self._begin()
         # Should it have died since, the pipe closes, which is how any stillborn process is noticed.
         with suppress(BrokenPipeError):
             socket.send_fds(self._desk, [request], [told])
         os.close(told)
         return os.fdopen(said, errors="replace")
+
+    def tend(self, *, owes: bool) -> bool:
+        """Kills it, with all that it has not begun, where it owes a process and hangs; whether it did.
+
+        To be called several times a second.
+        """
+        now = time.monotonic()
+        passed_s, self._looked = min(now - self._looked, _PAUSE_S), now
+        with suppress(BlockingIOError, ConnectionResetError):
+            if self._desk.recv(1, socket.MSG_DONTWAIT):
+                self._longest_s, self._owed_s = _BIRTH_S, 0.0
+        self._owed_s = self._owed_s + passed_s if owes else 0.0
+        if self._owed_s <= self._longest_s or self._process.poll() is not None:
+            return False
+        self._process.kill()
+        self._process.wait()
+        return True
 
     def stop(self) -> None:
         """Ends it; what it has not begun yet will not begin."""
@@ -69,11 +93,12 @@ class Nursery:
         self._process.kill()
         self._process.wait()
 
-    def _begin(self) -> None:
-        self._desk, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    def _begin(self) -> tuple[socket.socket, subprocess.Popen[bytes]]:
+        self._longest_s, self._owed_s = _LOADING_S, 0.0
+        desk, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # A session of its own keeps Ctrl-C for the launcher, which stops all in order.
         with theirs:
-            self._process = subprocess.Popen(
+            return desk, subprocess.Popen(
                 [sys.executable, "-m", "services.nursery"],
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
@@ -106,6 +131,11 @@ class Child:
             self._last.append("it could not be started")
             self._status = 1
         return self._status
+
+    @property
+    def is_unborn(self) -> bool:
+        """Whether the nursery has not begun it yet."""
+        return self._pid is None and self.status is None
 
     @property
     def was_refused(self) -> bool:
@@ -217,7 +247,7 @@ class Fleet:
     def __init__(
         self, launches: list[Launch], say: Callable[[str], None], budget: int, pulse: Pulse
     ):
-        self._budget, self._pulse = budget, pulse
+        self._say, self._budget, self._pulse = say, budget, pulse
         self._nursery = Nursery()
         self._failed: Post | None = None
         posts = [Post(launch, self._nursery, say) for launch in reversed(launches)]
@@ -226,6 +256,8 @@ class Fleet:
     def tend(self) -> bool:
         """Starts again what has died; False when the run is over, well or not."""
         self._pulse.look()
+        if self._nursery.tend(owes=any(post.child.is_unborn for post in self._posts)):
+            self._say("suturetrack run: what starts the processes hung and was killed")
         # All are looked at before the run is called over: who ends well hides nobody's death.
         held = [self._tend(post) for post in self._posts]
         return all(held)
@@ -233,7 +265,7 @@ class Fleet:
     def complaint(self) -> str | None:
         """Why the run failed; None when every process ended as it should."""
         for post in self._posts:
-            back = not post.starts or self._pulse.has_heard(post.child.name, post.starts)
+            back = not post.starts or self._pulse.is_ready(post.child.name, post.starts)
             if post is not self._failed and (post.is_vacant or not back):
                 return f"the {post.child.name} died, and the run ended before it was back"
         if self._failed is None:
@@ -255,6 +287,8 @@ class Fleet:
         """Whether there is still somebody to do the work of a post, now or soon."""
         if post.is_vacant:
             post.refill()
+            return True
+        if post.child.is_unborn:
             return True
         if post.child.status is None:
             trouble = self._pulse.trouble(post.child.name, post.starts)

@@ -46,6 +46,8 @@ class Health:
     """What a person should know, for example that recording stopped; empty when all is well."""
     restarts: int = 0
     """How often the process died before and was started again."""
+    ready: bool = True
+    """False while it still begins, or waits for what it needs to begin."""
 
 
 @dataclass(frozen=True)

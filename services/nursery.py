@@ -23,12 +23,15 @@ LONGEST_REQUEST = 1 << 16
 def main() -> None:
     """Forks a process for each request on the socket that is its standard input, until that closes.
 
-    A request is the arguments of the process as a JSON list, with the pipe for what it says.
+    A request is the arguments of the process as a JSON list, with the pipe for what it says. That all is
+    loaded, it says by one byte.
     """
     with suppress(OSError):
         Path("/proc/self/comm").write_text("nursery")
     desk = socket.socket(fileno=os.dup(0))
     _load()
+    with suppress(BrokenPipeError):
+        desk.send(b"!")
     while True:
         request, pipes, _, _ = socket.recv_fds(desk, LONGEST_REQUEST, 1)
         if not request:

@@ -9,8 +9,12 @@ from services.messages import Health
 
 _SILENT_S = 5.0
 """Without a heartbeat until a process counts as hung."""
+_SILENT_AT_FIRST_S = 10.0
+"""The same before its first heartbeat."""
 _STILL = 10
 """Heartbeats, thus seconds, without a frame until a process counts as hung, while there are frames."""
+_BEGINNING = 180
+"""The same until a process is ready, unless it waits for another: kernels may have to be compiled."""
 _PAUSE_S = 1.0
 """Between two looks until it was the one who looks that stood still."""
 _FEEDS = {"segmenter": "source", "tracker": "segmenter"}
@@ -24,7 +28,7 @@ class _Beat:
     health: Health
     at: float
     still: int = 0
-    """Heartbeats since its last frame at which there would have been frames."""
+    """Heartbeats since its last frame at which there would have been frames; at first, of beginning."""
 
 
 class Pulse:
@@ -32,49 +36,65 @@ class Pulse:
 
     def __init__(self) -> None:
         self._beats: dict[str, _Beat] = {}
+        self._awaited: dict[tuple[str, int], float] = {}
+        """By process and number of starts: since when its first heartbeat is waited for."""
         self._looked = 0.0
 
     def hear(self, health: Health, now: float | None = None) -> None:
         """Takes in a heartbeat."""
         now = time.monotonic() if now is None else now
         name, last = health.process, self._beats.get(health.process)
-        if last is None or last.health.restarts != health.restarts:
+        if last is None or (last.health.restarts, last.health.ready) != (
+            health.restarts,
+            health.ready,
+        ):
             self._beats[name] = _Beat(health, now)
+            return
+        if not health.ready:
+            self._beats[name] = _Beat(health, now, 0 if health.warning else last.still + 1)
             return
         moved = _progress(health) != _progress(last.health)
         for other, feed in _FEEDS.items():
-            if moved and feed == name and other in self._beats:
+            if moved and feed == name and other in self._beats and self._beats[other].health.ready:
                 self._beats[other].still += 1
         waits = name in _FEEDS or health.warning or not health.stamp or not health.stamp.period_ns
         still = 0 if moved else last.still + (not waits)
         self._beats[name] = _Beat(health, now, still)
 
-    def has_heard(self, process: str, starts: int) -> bool:
-        """Whether a process that was started again so many times has told of itself since."""
+    def is_ready(self, process: str, starts: int) -> bool:
+        """Whether a process that was started again so many times has been ready since."""
         beat = self._beats.get(process)
-        return beat is not None and beat.health.restarts == starts
+        return beat is not None and beat.health.restarts == starts and beat.health.ready
 
     def look(self, now: float | None = None) -> None:
         """Forgives everyone where the one who looks stood still itself."""
         now = time.monotonic() if now is None else now
         if now - self._looked > _PAUSE_S:
+            self._awaited.clear()
             for beat in self._beats.values():
                 beat.at, beat.still = now, 0
         self._looked = now
 
     def trouble(self, process: str, starts: int) -> str:
         """Why a process that was started again so many times counts as hung; empty when it does not."""
-        if not self.has_heard(process, starts):
-            return ""
-        beat = self._beats[process]
+        beat = self._beats.get(process)
+        if beat is None or beat.health.restarts != starts:
+            silent_s = self._looked - self._awaited.setdefault((process, starts), self._looked)
+            return _silence(silent_s) if silent_s > _SILENT_AT_FIRST_S else ""
         silent_s = self._looked - beat.at
         if silent_s > _SILENT_S:
-            return f"nothing was heard of it for {silent_s:.0f} s"
+            return _silence(silent_s)
+        if not beat.health.ready:
+            return f"it was not ready after {beat.still} s" if beat.still > _BEGINNING else ""
         stamp = beat.health.stamp
         period_s = stamp.period_ns / 1e9 if stamp else 0.0
         if beat.still > max(_STILL, _STILL * period_s):
             return f"it finished no frame for {beat.still} s"
         return ""
+
+
+def _silence(seconds: float) -> str:
+    return f"nothing was heard of it for {seconds:.0f} s"
 
 
 def _progress(health: Health) -> tuple[int, int]:

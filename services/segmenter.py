@@ -60,8 +60,9 @@ def run(service: Service, config: SegmenterConfig) -> None:
     if held is not None:
         given = [seed for seed in given if seed.thread not in held.threads]
     bus.keep(topics.STEP)
-    if not bus.wait_for_alive("tracker"):
-        raise Stopped
+    with service.waiting("the tracker"):
+        if not bus.wait_for_alive("tracker"):
+            raise Stopped
     frames = bus.newest(topics.FRAME)
     service.ready()
     for frame in frames:

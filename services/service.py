@@ -84,6 +84,7 @@ class Service:
         self.recorder: Recorder | None = None
         self.warning = ""
         """What is wrong at present, for the health; empty when nothing is."""
+        self._ready = False
         self._unrecorded: deque[Health] = deque(maxlen=8)
         self._complaints: deque[str] = deque(maxlen=8)
         self._last_complaint = float("-inf")
@@ -92,10 +93,18 @@ class Service:
 
     def calibrated_rig(self) -> StereoRig:
         """The rig as the source tells it, as soon as there is a source; raises Stopped."""
-        rig = self.bus.ask_until_answered(topics.CALIBRATION, None)
+        with self.waiting("the source"):
+            rig = self.bus.ask_until_answered(topics.CALIBRATION, None)
         if rig is None:
             raise Stopped
         return rig
+
+    @contextmanager
+    def waiting(self, what: str) -> Iterator[None]:
+        """Says in the health what the process waits for, so that nobody takes it for hung."""
+        self.warning = f"waits for {what}"
+        yield
+        self.warning = ""
 
     def record(self, rig: StereoRig, config: object) -> Recorder:
         """Opens the recording; it is closed with the service."""
@@ -107,9 +116,9 @@ class Service:
         return self.recorder
 
     def ready(self) -> None:
-        """Tells everyone that the process is ready, and starts the heartbeat."""
+        """Tells everyone that the process is ready."""
+        self._ready = True
         self.bus.declare_alive()
-        self._heartbeat.start()
         log.info("ready")
 
     def finished(self, stamp: Stamp) -> int:
@@ -148,9 +157,11 @@ class Service:
             memory_mb=psutil.Process().memory_info().rss / 1e6,
             warning=self.warning or (self.recorder and self.recorder.problem) or "",
             restarts=self.config.resume,
+            ready=self._ready,
         )
 
     def __enter__(self) -> Self:
+        self._heartbeat.start()
         return self
 
     def __exit__(
@@ -160,11 +171,10 @@ class Service:
         trace: TracebackType | None,
     ) -> None:
         self.bus.stop.set()
-        if self._heartbeat.ident is not None:  # was started, and may have ended by itself
-            self._heartbeat.join()
-            last = self.health()
-            self.bus.publish(topics.HEALTH, last)
-            self._unrecorded.append(last)
+        self._heartbeat.join()
+        last = self.health()
+        self.bus.publish(topics.HEALTH, last)
+        self._unrecorded.append(last)
         if self.recorder is not None:
             while self._unrecorded:
                 self.recorder.health(self._unrecorded.popleft())
@@ -177,7 +187,8 @@ class Service:
         while not self.bus.stop.wait(HEARTBEAT_S):
             health = self.health()
             self.bus.publish(topics.HEALTH, health)
-            self._unrecorded.append(health)
+            if health.ready:
+                self._unrecorded.append(health)
 
 
 @contextmanager

@@ -56,8 +56,10 @@ def run(service: Service, config: TrackerConfig) -> None:
         for seed in given:
             desk.seed(seed)
     recorder = service.record(rig, config)
-    if config.service.lockstep and not bus.wait_for_readers(topics.STEP):
-        raise Stopped
+    if config.service.lockstep:
+        with service.waiting("the source"):
+            if not bus.wait_for_readers(topics.STEP):
+                raise Stopped
     fields = bus.newest(topics.FIELD)
     service.ready()
     gate = Gate(rig, ordered=not config.service.lockstep)

@@ -111,6 +111,28 @@ def test_a_process_that_hangs_is_ended_and_started_again(system: System) -> None
     assert "the segmenter hung and was killed: nothing was heard of it for 5 s" in system.said
 
 
+def test_a_process_that_hangs_before_it_is_ready_is_ended_and_started_again(
+    system: System,
+) -> None:
+    kill(system, "tracker")
+    pid = system.pid("tracker")
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
+    system.until(lambda: system.pid("tracker") not in (None, pid))
+    system.until_tracking()
+    assert system.said.count("the tracker hung and was killed: nothing was heard of it") == 1
+
+
+def test_a_nursery_that_hangs_is_replaced_when_it_is_needed(system: System) -> None:
+    hung = nursery(system)
+    assert hung is not None
+    hung.suspend()
+    kill(system, "source")
+    system.until_tracking()
+    assert nursery(system) not in (None, hung)
+    assert "what starts the processes hung and was killed" in system.said
+
+
 def test_deaths_lose_neither_threads_nor_more_than_a_second_of_recordings(system: System) -> None:
     """The last one on this system, which it stops."""
     die_at_random(system, 1, most_s=SOON_S)
@@ -165,6 +187,10 @@ def restarts(system: System) -> int:
     return system.said.count("it is started again")
 
 
+def recordings(system: System) -> int:
+    return len(list(system.run_dir.glob("*.rrd")))
+
+
 def die_at_random(
     system: System, times: int, processes: tuple[str, ...] = ROLES, most_s: float = 2.0
 ) -> None:
@@ -175,7 +201,7 @@ def die_at_random(
         lambda s: seen.setdefault(s.state.stamp.frame, s.state.stamp.released_ns / 1e9)
     )
     system.until_tracking()
-    before, earlier = system.client.latest(), restarts(system)
+    before, earlier, files = system.client.latest(), restarts(system), recordings(system)
     assert before is not None
     for _ in range(times):
         for process in processes:
@@ -197,7 +223,7 @@ def die_at_random(
     folder = RunFolder(system.run_dir)
     assert not [p for p in folder.problems if "is no recording" in p]
     assert restarts(system) == earlier + len(deaths)
-    assert len(folder.files) == 3 + restarts(system)
+    assert len(folder.files) == recordings(system) == files + len(deaths)
     for process in ("tracker", "source"):
         recorded = folder.handled(process)
         ends = [when for name, when in deaths if name == process]

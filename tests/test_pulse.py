@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from services.messages import Health, Latency
 from services.pulse import Pulse
 from suturetrack.types import Stamp
@@ -15,6 +17,10 @@ def beat(
     stamp = Stamp(frames, frames, frames, period_ns) if frames else None
     figures = (1.0, Latency(), 1.0, Latency())
     return Health(process, 1, stamp, *figures, frames, 0, 0, 1.0, warning, restarts)
+
+
+def unready(process: str, restarts: int = 0, warning: str = "") -> Health:
+    return replace(beat(process, 0, restarts, warning), ready=False)
 
 
 class Run:
@@ -47,6 +53,34 @@ def test_silence_is_noticed_after_five_seconds_and_ends_with_a_new_life() -> Non
     assert run.pulse.trouble("tracker", 1) == ""
     run.pass_second(beat("tracker", 1, restarts=1))
     assert run.pulse.trouble("tracker", 1) == ""
+
+
+def test_a_process_that_was_never_heard_of_is_noticed_after_ten_seconds() -> None:
+    run = Run()
+    for second in range(1, 20):
+        run.pass_second(*(beat(name, 30 * second) for name in FEEDS[:2]))
+        if second != 11:  # the tenth after the first look
+            assert set(run.troubles()) == ({"tracker"} if second > 11 else set()), second
+    assert "nothing was heard of it for" in run.troubles()["tracker"]
+    run.pass_second(unready("tracker"))
+    assert run.troubles() == {}
+    assert not run.pulse.is_ready("tracker", 0)
+    for _ in range(6):
+        run.pass_second(*(beat(name, 900) for name in FEEDS[:2]))
+    assert set(run.troubles()) == {"tracker"}
+
+
+def test_a_process_that_never_gets_ready_is_noticed_unless_it_waits_for_another() -> None:
+    run = Run()
+    for second in range(1, 400):
+        waits = unready("tracker", warning="waits for the source" if second < 200 else "")
+        run.pass_second(unready("source", warning="waits"), beat("segmenter", 30 * second), waits)
+        if second != 380:
+            assert set(run.troubles()) == ({"tracker"} if second > 380 else set()), second
+    assert "not ready after" in run.troubles()["tracker"]
+    run.pass_second(unready("source"), beat("segmenter", 1), beat("tracker", 0))
+    assert run.troubles() == {}
+    assert run.pulse.is_ready("tracker", 0)
 
 
 def test_a_loop_that_stands_still_is_noticed_though_its_heart_beats() -> None:
