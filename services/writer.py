@@ -173,7 +173,10 @@ class Writer:
 
     def _latency(self, stamp: Stamp, published_ns: int | None) -> None:
         latency_ms = ((published_ns or time.time_ns()) - stamp.released_ns) / 1e6
-        self.write(stamp, [(f"/plots/latency_ms/{self.process}", rr.Scalars(latency_ms))])
+        self.write(
+            stamp,
+            [(f"/plots/latency_ms/{self.process}", drawing.row(rr.Scalars, scalars=latency_ms))],
+        )
 
     def _initialization(
         self, stamp: Stamp, thread: str, result: Initialization | InitializationError

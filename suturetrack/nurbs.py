@@ -182,7 +182,9 @@ def _with_stop(c: Float64, t: Float64, stop: float) -> tuple[Float64, Float64]:
 
 def _homogeneous(curve: Nurbs) -> BSpline:
     w = curve.weights[:, None]
-    return BSpline(curve.knots, np.c_[curve.control_points * w, w], curve.degree)
+    weighted = np.concatenate([curve.control_points * w, w], axis=1)
+    # Without the checks, which take longer than a curve's evaluation.
+    return BSpline.construct_fast(curve.knots, weighted, curve.degree)
 
 
 def _nurbs(spline: BSpline) -> Nurbs:

@@ -4,7 +4,7 @@ The functions yield `(entity, archetypes...)` and touch no file. Pictures and ov
 pixels, points in the calibration's unit, plots in the units that their names carry.
 """
 
-from services.drawing.common import Entry, Level, values
+from services.drawing.common import Entry, Level, Row, row, values
 from services.drawing.curves import overlay_style, states, thread_style, truth, truth_style
 from services.drawing.events import kinds, lane, marks
 from services.drawing.growth import cleared, failure, growth, outcome, seed
@@ -13,6 +13,7 @@ from services.drawing.images import cameras, field, frame, process_style
 __all__ = [
     "Entry",
     "Level",
+    "Row",
     "cameras",
     "cleared",
     "failure",
@@ -25,6 +26,7 @@ __all__ = [
     "outcome",
     "overlay_style",
     "process_style",
+    "row",
     "seed",
     "states",
     "thread_style",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from typing import Any, Literal
 
 import cv2
@@ -18,7 +20,7 @@ Level = Literal["light", "full"]
 Color = tuple[int, int, int]
 """RGB."""
 Entry = tuple[Any, ...]
-"""(entity path, archetype, ...)"""
+"""(entity path, archetype or row, ...)"""
 
 VIEWS = ("left", "right")
 GREEN: Color = (70, 220, 90)
@@ -52,6 +54,46 @@ def values(name: str, numbers: Mapping[str, Any]) -> rr.DynamicArchetype:
     # Arrow arrays made here cost a fifth of those that Rerun would make.
     columns = {key: pa.array(np.ravel(value)) for key, value in numbers.items()}
     return rr.DynamicArchetype(name, components=columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """What an archetype would hold, as bare arrays or lists: many rows make one archetype.
+
+    One archetype costs as much as the drawing of a whole state, so those of every frame are made late.
+    """
+
+    archetype: Any
+    """The class, or the name of one of our own, whose components are flat arrays."""
+    components: dict[str, Any]
+    """By name; those of one name are alike but for their length."""
+
+    @staticmethod
+    def joined(rows: Sequence[Row]) -> Any:
+        """The archetype of all rows, one after the other."""
+        components = {
+            name: _joined([row.components[name] for row in rows]) for name in rows[0].components
+        }
+        if isinstance(rows[0].archetype, str):
+            return values(rows[0].archetype, components)
+        return rows[0].archetype.from_fields(**components)
+
+
+def row(archetype: Any, **components: Any) -> Row:
+    """Components of one frame; single numbers and words count as lists of one.
+
+    Under a name of our own arrays are flattened.
+    """
+    listed = np.ravel if isinstance(archetype, str) else _listed
+    return Row(archetype, {name: listed(what) for name, what in components.items()})
+
+
+def _listed(what: Any) -> Any:
+    return what if isinstance(what, list | np.ndarray) else np.array([what])
+
+
+def _joined(pieces: list[Any]) -> Any:
+    return list(chain(*pieces)) if isinstance(pieces[0], list) else np.concatenate(pieces)
 
 
 def part(name: str) -> str:

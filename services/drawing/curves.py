@@ -25,8 +25,8 @@ from services.drawing.common import (
     Color,
     Entry,
     part,
+    row,
     series,
-    values,
 )
 from services.drawing.events import event_style
 from suturetrack import nurbs
@@ -66,7 +66,7 @@ def states(
         yield from _in_space(state, arrows, slope, pieces, rig)
         yield from _motion(state, before.get(state.thread), arrows, slope, rig)
         yield from _plots(state, rig)
-        numbers = values("ThreadState", _numbers(state, published_ns))
+        numbers = row("ThreadState", **_numbers(state, published_ns))
         yield f"/rig/thread/{part(state.thread)}/nurbs", numbers
 
 
@@ -79,11 +79,11 @@ def truth(truth: Truth, rig: StereoRig) -> Iterator[Entry]:
         "length": truth.length,
         "visible": truth.visible,
     }
-    line = rr.LineStrips3D([truth.points])
-    yield f"/rig/truth/{part(truth.thread)}", line, values("Truth", numbers)
+    line = row(rr.LineStrips3D, strips=[truth.points])
+    yield f"/rig/truth/{part(truth.thread)}", line, row("Truth", **numbers)
     few = truth.points[np.linspace(0, len(truth.points) - 1, len(_S)).astype(int)]
     for view, pixels in zip(VIEWS, rig.project_raw(few), strict=True):
-        strip = rr.LineStrips2D([_finite(pixels)])
+        strip = row(rr.LineStrips2D, strips=[_finite(pixels)])
         yield f"/rig/{view}/image/truth/{part(truth.thread)}", strip
 
 
@@ -129,15 +129,15 @@ def thread_style(thread: str) -> Iterator[Entry]:
 def _overlays(
     strips: list[Strip], control_points: list[Float64], rig: StereoRig
 ) -> Iterator[Entry]:
-    colors, ends = [color for _, color in strips], np.cumsum([len(line) for line, _ in strips])
+    colors, ends = _colors(strips), np.cumsum([len(line) for line, _ in strips])
     lines = _projected([line for line, _ in strips], rig)
     points = _projected(control_points, rig)
     for view, line, dots in zip(VIEWS, lines, points, strict=True):
         pieces = [_finite(piece) for piece in np.split(line, ends[:-1])] if strips else []
         yield (
             f"/rig/{view}/image/curve",
-            rr.LineStrips2D(pieces, colors=colors),
-            rr.Points2D(_finite(dots)),
+            row(rr.LineStrips2D, strips=pieces, colors=colors),
+            row(rr.Points2D, positions=_finite(dots)),
         )
 
 
@@ -149,17 +149,18 @@ def _in_space(
     state: ThreadState, arrows: Float64, slope: Float64, strips: list[Strip], rig: StereoRig
 ) -> Iterator[Entry]:
     root = f"/rig/thread/{part(state.thread)}"
-    lines, colors = [line for line, _ in strips], [color for _, color in strips]
-    yield f"{root}/curve", rr.LineStrips3D(lines, colors=colors)
+    lines = [line for line, _ in strips]
+    yield f"{root}/curve", row(rr.LineStrips3D, strips=lines, colors=_colors(strips))
     control_points = samples = _NONE
     reliable = np.empty((0, 3), np.uint8)
     if state.curve is not None:
         control_points = state.curve.control_points
         samples = nurbs.evaluate(state.curve, np.linspace(0, 1, len(state.sigma)))
         reliable = _reliability_colors(state.sigma * rig.focal / samples[:, 2], state.seen)
-    yield f"{root}/control_points", rr.Points3D(control_points)
-    yield f"{root}/tangent", rr.Arrows3D(origins=arrows, vectors=slope / max(len(slope), 1))
-    yield f"{root}/reliability", rr.Points3D(samples, colors=reliable)
+    yield f"{root}/control_points", row(rr.Points3D, positions=control_points)
+    vectors = slope / max(len(slope), 1)
+    yield f"{root}/tangent", row(rr.Arrows3D, origins=arrows, vectors=vectors)
+    yield f"{root}/reliability", row(rr.Points3D, positions=samples, colors=reliable)
 
 
 def _motion(
@@ -176,20 +177,22 @@ def _motion(
         ahead = velocity * _AHEAD_S
         mm = np.linalg.norm(velocity, axis=1) * rig.metres_per_unit * 1000
         speed = [float(mm.mean()), float(mm.max())]
-    motion = rr.Arrows3D(origins=arrows[: len(ahead)], vectors=ahead)
+    motion = row(rr.Arrows3D, origins=arrows[: len(ahead)], vectors=ahead)
     yield f"/rig/thread/{part(state.thread)}/velocity", motion
-    yield f"/plots/{part(state.thread)}/speed", rr.Scalars(speed)
+    yield f"/plots/{part(state.thread)}/speed", row(rr.Scalars, scalars=speed)
 
 
 def _plots(state: ThreadState, rig: StereoRig) -> Iterator[Entry]:
     root, energies = f"/plots/{part(state.thread)}", state.energies
-    yield f"{root}/energy/image", rr.Scalars([energies.image_left, energies.image_right])
-    yield f"{root}/energy/end", rr.Scalars(energies.end)
-    yield f"{root}/energy/internal", rr.Scalars(energies.internal)
-    yield f"{root}/length", rr.Scalars(state.length * rig.metres_per_unit * 1000)
+    image = [energies.image_left, energies.image_right]
+    length_mm = state.length * rig.metres_per_unit * 1000
     count = 0 if state.curve is None else len(state.curve.control_points)
-    yield f"{root}/control_points", rr.Scalars(count)
-    yield f"{root}/status", rr.StateChange(state=state.status)
+    yield f"{root}/energy/image", row(rr.Scalars, scalars=image)
+    yield f"{root}/energy/end", row(rr.Scalars, scalars=energies.end)
+    yield f"{root}/energy/internal", row(rr.Scalars, scalars=energies.internal)
+    yield f"{root}/length", row(rr.Scalars, scalars=length_mm)
+    yield f"{root}/control_points", row(rr.Scalars, scalars=float(count))
+    yield f"{root}/status", row(rr.StateChange, state=[str(state.status)])
 
 
 def _numbers(state: ThreadState, published_ns: int) -> dict[str, Any]:
@@ -213,6 +216,11 @@ def _numbers(state: ThreadState, published_ns: int) -> dict[str, Any]:
         "control_points": state.curve.control_points,
         "weights": state.curve.weights,
     }
+
+
+def _colors(strips: list[Strip]) -> Image:
+    """(k, 3) RGB."""
+    return np.array([color for _, color in strips], np.uint8).reshape(-1, 3)
 
 
 def _points(state: ThreadState) -> Float64:
