@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from skimage.measure import euler_number, label
 
-from suturetrack.kernels import crest, growth, matching
+from suturetrack.kernels import crest, growth, matching, search
 from tests.reference import growth as reference
 
 
@@ -33,6 +33,27 @@ def test_growth_goes_on_from_a_second_origin_where_that_is_cheaper() -> None:
     growth.grow(magnitude, 21, 2, 30.0, 2.0, 0.1, cost)
     assert cost[2, 39] == pytest.approx(48.0)
     assert cost[2, 10] == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize(
+    ("first", "step", "count"), [(0.0, 1.0, 40), (-40.0, 1.0, 41), (3.3, 0.5, 30), (2.0, 1.0, 1)]
+)
+def test_matching_costs_are_one_less_the_response(first: float, step: float, count: int) -> None:
+    rng = np.random.default_rng(count)
+    field = rng.uniform(-0.7, 0.7, (12, 40, 2)).astype(np.float32)
+    field[rng.uniform(size=(12, 40)) < 0.3] = 0
+    pixels = np.r_[rng.uniform((-1, -1), (41, 12), (30, 2)), [[39, 0], [39, 11], [0, 12]]]
+    angles = rng.uniform(0, np.pi, len(pixels))
+    tangents = np.c_[np.cos(angles), np.sin(angles)]
+    costs = matching.matching_costs(field, pixels, tangents, first, step, count, 0.6)
+    across = pixels[:, :1] - first - step * np.arange(count)
+    places = np.stack([across, np.broadcast_to(pixels[:, 1:], across.shape)], axis=-1)
+    response = search.responses(field, places.reshape(-1, 2), tangents.repeat(count, axis=0))
+    expected = np.maximum(1 - response.reshape(across.shape) / 0.6, 0)
+    expected[(across < 0) | (across > 39)] = matching.UNSEEN
+    np.testing.assert_allclose(costs, expected, atol=1e-6)
+    assert (costs < 0.9).any()
+    assert (costs == 1).any()
 
 
 @pytest.mark.parametrize("seed", range(5))

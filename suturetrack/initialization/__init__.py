@@ -10,7 +10,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization.confidence import judge
 from suturetrack.initialization.ends import move_end, read_end
 from suturetrack.initialization.fitting import fit_marks, image_parameters, refine
-from suturetrack.initialization.growth import follow_thread, grow_thread, nearest_segment
+from suturetrack.initialization.growth import Thread, follow_thread, grow_thread, nearest_segment
 from suturetrack.initialization.hypotheses import Hypothesis, find_thread
 from suturetrack.initialization.matching import Match, match, raised, row_offset
 from suturetrack.initialization.model import (
@@ -87,11 +87,11 @@ def _initialize(
         reason = _nothing_there(scale * candidates, scale * pixel, config)
         raise InitializationError(reason, candidates)
     nearest = float(rig.left.projection[0, 2] - rig.right.projection[0, 2])
-    chain = follow_thread(left, origin, config).chain
-    rows = row_offset(chain, field.left, field.right, nearest)
+    thread = follow_thread(left, origin, config)
+    rows = row_offset(thread.chain, field.left, field.right, nearest)
     found: Initialization | None = None
     try:
-        found = _reconstruct(field, left, rig, origin, pixel, config, scale)
+        found = _reconstruct(field, left, thread, rig, pixel, config, scale)
     except InitializationError:
         if not rows:
             raise
@@ -99,7 +99,7 @@ def _initialize(
         return found
     moved = RidgeField(field.stamp, field.left, raised(field.right, rows))
     try:
-        other = _reconstruct(moved, left, rig, origin, pixel, config, scale)
+        other = _reconstruct(moved, left, thread, rig, pixel, config, scale)
     except InitializationError:
         if found is None:
             raise
@@ -115,17 +115,17 @@ def _initialize(
 def _reconstruct(
     field: RidgeField,
     left: Ridges,
+    thread: Thread,
     rig: StereoRig,
-    origin: int,
     pixel: Float64,
     config: InitializationConfig,
     scale: int,
 ) -> Initialization:
-    """The thread through segment `origin` of the left view."""
+    """The curve of a thread of the left view."""
     nearest = float(rig.left.projection[0, 2] - rig.right.projection[0, 2])
     candidates = nearest_segment(left, pixel, config.snap_px)[1]
     ridges = left, find_ridges(field.right, config)
-    found = find_thread(field, ridges, origin, pixel, nearest, config)
+    found = find_thread(field, ridges, thread, pixel, nearest, config)
     pixels = found.pixels
     step = max(1, round(config.step_px))
     marks = pixels[::step].reshape(-1, 2, 2)

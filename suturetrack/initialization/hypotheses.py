@@ -62,28 +62,26 @@ class Hypothesis:
 def find_thread(
     field: RidgeField,
     ridges: tuple[Ridges, Ridges],
-    origin: int,
+    left: Thread,
     seed: Float64,
     nearest: float,
     config: InitializationConfig,
 ) -> Hypothesis:
-    """The thread through segment `origin` of the left view as the view shows it that shows it better.
+    """A thread of the left view as the view shows it that shows it better.
 
     Args:
         field: both views.
         ridges: of the left and the right view.
-        origin: segment of the left view.
+        left: the thread as the left view by itself has it, whatever its depth.
         seed: (2,) left pixel on it.
         nearest: disparity of points at infinity, px.
         config: settings.
     """
-    left = follow_thread(ridges[0], origin, config)
     matched = match(left.chain, field.left, field.right, nearest, 1)
     apart = (left.chain.pixels - matched.pixels)[matched.inside, 0]
     if len(apart):
-        left = follow_thread(
-            ridges[0], origin, config, Depth.around(apart, field.left, field.right)
-        )
+        depth = Depth.around(apart, field.left, field.right)
+        left = follow_thread(ridges[0], left.origin, config, depth)
         left = without_faint_tails(left, seed)
         matched = match(left.chain, field.left, field.right, nearest, 1)
     there = matched.pixels[_closest(left.chain.pixels, seed)]

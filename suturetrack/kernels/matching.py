@@ -6,7 +6,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from suturetrack.kernels.search import response_at
 from suturetrack.types import Float32, Float64
 
 Int64 = NDArray[np.int64]
@@ -36,18 +35,45 @@ def matching_costs(
         count: number of states.
         level: response of eq. (4) that a thread is known to give.
     """
+    width = field.shape[1]
     costs = np.empty((len(pixels), count), np.float32)
+    line = np.zeros(width)
     for k in range(len(pixels)):
         u, v = pixels[k]
-        tu, tv = tangents[k]
+        # All states of a pixel lie in one row: its columns are looked at once.
+        least = min(max(int(u - first - step * (count - 1)), 0), width - 2)
+        most = min(int(u - first) + 1, width - 1)
+        _respond(field, v, tangents[k, 0], tangents[k, 1], least, most, line)
         for state in range(count):
             across = u - first - step * state
-            if 0 <= across <= field.shape[1] - 1:
-                response = response_at(field, across, v, tu, tv)
+            if 0 <= across <= width - 1:
+                column = min(int(across), width - 2)
+                share = across - column
+                response = (1 - share) * line[column] + share * line[column + 1]
                 costs[k, state] = max(1 - response / level, 0.0)
             else:
                 costs[k, state] = UNSEEN
     return costs
+
+
+@numba.njit(cache=True, nogil=True)
+def _respond(
+    field: Float32, v: float, tu: float, tv: float, least: int, most: int, line: Float64
+) -> None:
+    """Fills `line`, (W,), from column `least` to `most` with the responses in row `v`."""
+    height = field.shape[0]
+    row = min(max(int(v), 0), height - 2)
+    lower = v - row
+    for column in range(least, most + 1):
+        line[column] = 0.0
+        if 0 <= v <= height - 1:
+            for i in range(2):
+                x, y = field[row + i, column, 0], field[row + i, column, 1]
+                squared = x * x + y * y
+                if squared > 0:
+                    along = tu * x + tv * y
+                    share = lower if i else 1 - lower
+                    line[column] += share * along * along / np.sqrt(squared)
 
 
 @numba.njit(cache=True, nogil=True)
