@@ -211,6 +211,19 @@ def test_strands_of_one_thread_are_told_apart(scenario: str, seed: int) -> None:
     assert found.confidence > 0.5
 
 
+def test_a_crossing_that_neither_view_can_tell_is_doubtful() -> None:
+    """Another thread runs beside this one, and leaves it more smoothly than it goes on itself."""
+    scene = open_scene("clutter", 250)
+    frame = StereoFrame(STAMP, *scene.render(0))
+    start = Seed(pixel=scene.seed_pixel(0))
+    segmenter = Segmenter(scene.rig)
+    segmenter.learn(frame, start)
+    found = initialize(segmenter.step(frame), scene.rig, start)
+    is_right = curve_error(dense(found.curve), scene.truth(0)[0].points).rms < 0.3
+    assert (found.confidence >= 0.5) == is_right
+    assert is_right or any("an ambiguous crossing" in reason for reason in found.reasons)
+
+
 def test_a_highlight_is_bridged(rig: StereoRig, curve: Nurbs) -> None:
     truth = dense(curve)
     views = []

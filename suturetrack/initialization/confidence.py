@@ -11,10 +11,13 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization.fitting import Samples
 from suturetrack.initialization.growth import Chain
 from suturetrack.initialization.segments import Ridges
+from suturetrack.initialization.topology import CROSSING
 from suturetrack.metrics import coverage, polyline_length
 from suturetrack.types import Float64, Nurbs
 
 Int64 = NDArray[np.int64]
+Doubt = tuple[Float64, str, float]
+"""A pixel (2,), what is doubtful there, and the confidence that this leaves."""
 
 _AGREED = 0.95
 """Share of the thread from which both views are said to agree."""
@@ -36,6 +39,8 @@ _SHARP = 0.5
 _SHARP_COSINE = 0.5
 _BEND_REACH = 8
 """Pixels on both sides of a place between which the curve bends there."""
+_GRAVE = 0.6
+"""What a grave doubt leaves of the confidence at most."""
 _FEW = 6
 """Points of another ridge that say nothing."""
 
@@ -73,21 +78,13 @@ def judge(
     if vague > _VAGUE / 2:
         reasons.append(f"uncertain depth: even its best parts to {vague:.1%} of the length only")
     confidence /= 1 + (vague / _VAGUE) ** 6
-    lowest = 1.0
+    doubts = [_settled(_distinct(c), p, r) for c, p, r in zip(chains, pixels, ridges, strict=True)]
     for view, name in enumerate(("left", "right")):
-        doubts = _settled(_distinct(chains[view]), pixels[view], ridges[view])
         reasons += [
             f"{why} in the {name} view at ({scale * u:.0f}, {scale * v:.0f})"
-            for (u, v), why, _ in doubts
+            for (u, v), why, _ in doubts[view]
         ]
-        # Two views that come to the same by themselves are not both mistaken easily.
-        other = chains[1 - view].pixels
-        rests = [
-            np.sqrt(rest) if _is_shared(place, pixels[view], pixels[1 - view], other) else rest
-            for place, _, rest in doubts
-        ]
-        lowest = min(lowest, float(np.prod(rests)))
-    confidence *= lowest
+    confidence *= min(_remaining(view, doubts, pixels, chains) for view in (0, 1))
     for end in (0, 1):
         readings = [samples.ends[view][end] for view in (0, 1)]
         if any(r.at_border for r in readings):
@@ -106,9 +103,7 @@ def clarity(chain: Chain, places: Float64) -> float:
     return float(np.prod([rest for where, _, rest in _distinct(chain) if _is_near(where, places)]))
 
 
-def _settled(
-    doubts: list[tuple[Float64, str, float]], line: Float64, ridges: Ridges
-) -> list[tuple[Float64, str, float]]:
+def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
     """The doubts that are left once the whole curve is known.
 
     Where a single pass of the curve, (k, 2) pixels, is all the ridge near a place, there is no other
@@ -122,6 +117,32 @@ def _settled(
         elif _bends_sharply(line[near]):
             kept.append((place, "a sharp bend", max(rest, _SHARP)))
     return kept
+
+
+def _remaining(
+    view: int,
+    doubts: list[list[Doubt]],
+    lines: tuple[Float64, Float64],
+    chains: tuple[Chain, Chain],
+) -> float:
+    """What the doubts of a view leave of the confidence; `lines` are the curve in both views.
+
+    Two views that come to the same by themselves are not both mistaken easily, but what neither
+    could tell stays doubtful.
+    """
+    line, counterpart = lines[view], lines[1 - view]
+    left = 1.0
+    for place, why, rest in doubts[view]:
+        there = counterpart[np.argmin(np.linalg.norm(line - place, axis=1))]
+        same = [d[2] for d in doubts[1 - view] if d[1] == why and _is_near(there, d[0][None])]
+        both = max(rest, min(same, default=1.0))
+        if not _is_shared(place, line, counterpart, chains[1 - view].pixels):
+            left *= rest
+        elif why == CROSSING and both < _GRAVE:
+            left *= both
+        else:
+            left *= np.sqrt(rest)
+    return left
 
 
 def _is_shared(place: Float64, line: Float64, counterpart: Float64, chain: Float64) -> bool:
@@ -162,9 +183,9 @@ def _is_near(where: Float64, places: Float64) -> bool:
     return bool((np.linalg.norm(places - where, axis=1) <= _SAME_PLACE_PX).any())
 
 
-def _distinct(chain: Chain) -> list[tuple[Float64, str, float]]:
+def _distinct(chain: Chain) -> list[Doubt]:
     """The doubts, the gravest first, one for each place."""
-    kept: list[tuple[Float64, str, float]] = []
+    kept: list[Doubt] = []
     for doubt in sorted(chain.doubts, key=lambda d: d[2]):
         if all(np.linalg.norm(doubt[0] - other[0]) > _SAME_PLACE_PX for other in kept):
             kept.append(doubt)

@@ -17,6 +17,8 @@ from suturetrack.types import Float64
 
 Int64 = NDArray[np.int64]
 
+CROSSING = "an ambiguous crossing"
+"""Why a thread is doubtful where it might leave a crossing another way."""
 _REASSURANCE = 0.3
 """Share of its lead over the next best way that the price of a merge is less doubtful by."""
 _STRAIN = 1.5
@@ -53,7 +55,7 @@ class Merged:
                 found.append((entry, "a sharp bend", 0.6))
             elif strain > 0:
                 rest = max(1 - _STRAIN * strain, 0.1)
-                found.append((entry, "an ambiguous crossing", rest))
+                found.append((entry, CROSSING, rest))
         for tip in (entries[0], entries[-1] ^ 1):
             if self._runs_into_another(tip):
                 on = min((self.price[tip, j] for j in within.get(tip, ())), default=np.inf)
