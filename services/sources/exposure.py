@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from suturetrack.types import Image
 
@@ -22,17 +23,24 @@ def exposure_fault(image: Image) -> str:
     Args:
         image: (H, W) or (H, W, 3).
     """
-    lowest, highest = int(image.min()), int(image.max())
-    if lowest == highest:
-        return f"empty: every pixel is {lowest}"
-    if np.percentile(image, 99) < _BLACK:
+    counts = np.bincount(image.ravel(), minlength=256)
+    levels = np.flatnonzero(counts)
+    if len(levels) == 1:
+        return f"empty: every pixel is {levels[0]}"
+    if _quantile(counts, 0.99) < _BLACK:
         return "black: is the light on, and the lens uncovered?"
-    clipped = float((image == 255).mean())
-    if clipped > _CLIPPED and np.percentile(image[image < 255], 10) > _DARK:
+    clipped = counts[255] / image.size
+    if clipped > _CLIPPED and _quantile(counts[:255], 0.1) > _DARK:
         return (
             f"saturated: {clipped:.0%} of its values are clipped; lower the exposure or the light"
         )
     return ""
+
+
+def _quantile(counts: NDArray[np.int64], share: float) -> int:
+    """The value below which, or at which, a share of all values lies."""
+    below = np.cumsum(counts)
+    return int(np.searchsorted(below, share * below[-1]))
 
 
 class ExposureWatch:
