@@ -134,6 +134,25 @@ def test_any_seed_gives_the_same_curve(rig: StereoRig, curve: Nurbs) -> None:
         assert polyline_distances(reference, here).max() < 0.5
 
 
+@pytest.mark.parametrize(("scenario", "seed"), [("crossings", 200), ("knot", 204)])
+def test_any_seed_gives_the_same_curve_of_a_thread_that_crosses_itself(
+    scenario: str, seed: int
+) -> None:
+    scene = open_scene(scenario, seed)
+    frame = StereoFrame(STAMP, *scene.render(0))
+    segmenter = Segmenter(scene.rig)
+    start = Seed(pixel=scene.seed_pixel(0))
+    segmenter.learn(frame, start)
+    field = segmenter.step(frame)
+    reference = dense(initialize(field, scene.rig, start).curve, 400)
+    lines = scene.rig.project(reference)
+    for k in (1, 100, 300, 398):
+        found = initialize(field, scene.rig, Seed(point=tuple(reference[k])))
+        for here, there in zip(scene.rig.project(dense(found.curve, 400)), lines, strict=True):
+            assert polyline_distances(here, there).max() < 0.5
+            assert polyline_distances(there, here).max() < 0.5
+
+
 def test_a_seed_in_space_is_as_good_as_a_pixel(rig: StereoRig, curve: Nurbs) -> None:
     field, point = field_of_curve(curve, rig), dense(curve)[700]
     by_point = initialize(field, rig, Seed(point=tuple(point)))
