@@ -226,3 +226,12 @@ def test_two_runs_at_once_keep_apart_and_a_name_is_used_once(
     assert first.wait(20) == 0
     frames = [s.state.stamp.frame for s in RunFolder(tmp_path / "c").states()]
     assert frames == list(range(FRAMES))
+
+
+def test_garbage_is_not_looked_for_in_what_a_process_has_loaded(rig_name: str) -> None:
+    code = (
+        "import gc; from services import service; service.run("
+        "'viewer', service.ServiceConfig('test'), lambda _: print(gc.get_freeze_count()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) > 10_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
@@ -163,6 +164,9 @@ def measure(load: str, fps: float, seconds: float, options: list[str], folder: P
         # No state is ever live where frames come faster than states can.
         system.until(lambda: system.client.latest() is not None)
         slow = _slow_consumers(rig) if load.endswith(BESIDE) else []
+        # A pause of the consumer's own is no gap between states.
+        gc.collect()
+        gc.freeze()
         try:
             watch = _Watch(system)
             began = time.monotonic()
