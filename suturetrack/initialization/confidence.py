@@ -39,7 +39,7 @@ _SHARP = 0.5
 _SHARP_COSINE = 0.5
 _BEND_REACH = 8
 """Pixels on both sides of a place between which the curve bends there."""
-_GRAVE = 0.6
+_GRAVE = 0.53
 """What a grave doubt leaves of the confidence at most."""
 _FEW = 6
 """Points of another ridge that say nothing."""
