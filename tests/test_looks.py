@@ -259,3 +259,24 @@ def test_what_most_looks_find_takes_the_place_of_the_first(
     assert all(state.status is Status.OCCLUDED for state in states[:sure])
     assert all(state.status is Status.TRACKING for state in states[sure:])
     assert max(rms(state, pair(i)[1]) for i, state in enumerate(states) if i >= sure) < 0.25
+
+
+def test_a_plain_look_takes_the_place_of_a_hopeless_one_at_once(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    confidences = iter([0.05])
+
+    def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
+        confidence = next(confidences, 0.95)
+        seed = seed_on(rig, pair(field.stamp.frame)[int(confidence > 0.5)])
+        return replace(initialize(field, rig, seed), confidence=confidence)
+
+    looks_by(monkeypatch, look)
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, pair(0)[0]))
+    states = [tracker.step(field).states[0] for field in fields_of(rig, FPS, range(0))]
+    sure = next(i for i, state in enumerate(states) if "found for sure" in state.events)
+    assert rms(states[0], pair(0)[0]) < 0.15
+    assert all(state.status is Status.OCCLUDED for state in states[:sure])
+    assert all(state.status is Status.TRACKING for state in states[sure:])
+    assert max(rms(state, pair(i)[1]) for i, state in enumerate(states) if i >= sure) < 0.25

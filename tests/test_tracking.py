@@ -201,6 +201,24 @@ def test_a_hidden_end_is_held_and_taken_up_again(rig: StereoRig) -> None:
     assert max(error(states[-1], truths[-1]).ends) < 0.6
 
 
+def test_what_a_tool_has_swept_over_is_taken_up_as_a_whole(rig: StereoRig) -> None:
+    truths = [thread(i / FPS) + np.array([0.1 * i, 0.0, 0.0]) for i in range(50)]
+    fields, swept = [], range(10, 36)
+    for i, points in enumerate(truths):
+        place = points[np.clip(600 - 12 * (i - 10), 0, 599)]
+        u, v = rig.project(place)[0]
+        along = np.linspace(-1.0, 1.0, 200)[:, None] * np.array([20.0, 24.0, 0.0])
+        edges = [place + along + np.array([side, 0.0, 0.0]) for side in (-6.0, 6.0)]
+        shown = [points, *edges] if i in swept else [points]
+        hidden = [(float(u), float(v), 30.0)] if i in swept else []
+        fields.append(paint(rig, shown, i, hidden))
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    assert min(state.length for state in states[swept.stop :]) > 85.0
+    back = swept.stop + round(0.3 * FPS)
+    assert all(state.status is Status.TRACKING for state in states[back:])
+    assert error(states[-1], truths[-1]).rms < 0.15
+
+
 def test_a_thread_that_is_drawn_out_grows(rig: StereoRig) -> None:
     whole = thread(0.0)
     lengths = np.linspace(350, 560, 40).astype(int)

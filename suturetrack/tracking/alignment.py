@@ -37,6 +37,13 @@ def shifted(curve: Nurbs, field: RidgeField, rig: StereoRig, levels: tuple[float
     return curve_from(curve.degree, curve.knots, curve.control_points + offset)
 
 
+def shown(curve: Nurbs, field: RidgeField, rig: StereoRig, levels: tuple[float, float]) -> float:
+    """How much of the thread the images show where the curve is, in [0, 1]."""
+    s = np.linspace(0, 1, _PLACES)
+    both = views(rig, values_at(curve, s), values_at(curve, s, 1))
+    return float(_shown(both, np.zeros((1, 2)), (field.left, field.right), levels)[0])
+
+
 def _shown(
     both: tuple[View, View],
     shifts: Float64,

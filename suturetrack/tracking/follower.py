@@ -11,7 +11,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.tracking import gauss_newton, paper
-from suturetrack.tracking.alignment import shifted
+from suturetrack.tracking.alignment import shifted, shown
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange
 from suturetrack.tracking.ends import EndStep, EndWatch, doubled_ends, find_end
@@ -50,6 +50,8 @@ _SURE_AFTER_S = 0.08
 # How long a doubtful end is held before it is cut off.
 _PATIENCE_S = 0.06
 _SOME = 0.2
+# What has to be seen of the last good curve beyond what is seen of the rest, against the length.
+_MORE = 0.05
 # How long a thread is remembered to have been longer.
 _FORGOTTEN_S = 3.0
 # Places on a thread that keep other threads away.
@@ -122,6 +124,9 @@ class Follower:
         """The thread in the next field; `neighbours` are the strands of other threads."""
         model = self.model
         seconds = (field.stamp.capture_ns - model.capture_ns) * _NS
+        if self._lost or self._short:
+            self._take_up_whole(field, seconds)
+            model = self.model
         before, predicted = model.curve, model.motion.predict(model.curve, seconds)
         model.capture_ns = field.stamp.capture_ns
         if self.config.method == "paper":
@@ -245,6 +250,21 @@ class Follower:
         model = self.model
         ends = EndWatch(self.known_length, model.capture_ns)
         self.model = replace(model, curve=self.last_good, motion=Motion.none(), ends=ends)
+
+    def _take_up_whole(self, field: RidgeField, seconds: float) -> None:
+        """Goes back to the last good curve, moved as a whole, if the images show more of it than of
+        what is left."""
+        model = self.model
+        rest = model.motion.predict(model.curve, seconds)
+        whole = shifted(self.last_good, field, self.rig, model.levels)
+        of_whole, of_rest = (
+            length_of(curve) * shown(curve, field, self.rig, model.levels)
+            for curve in (whole, rest)
+        )
+        if of_whole > of_rest + _MORE * self.known_length:
+            self.last_good = whole
+            self._start_again()
+            self._doubt = Doubt.everywhere()
 
     def _follow_by_forces(
         self, field: RidgeField, neighbours: Neighbours

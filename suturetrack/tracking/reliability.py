@@ -28,7 +28,9 @@ ASTRAY = 0.05
 _LOST_AFTER_S = 0.2
 _DRIFT = 0.35
 _DRIFT_AT_REST_PX = 0.2
-_ANYWHERE_PX, _HOPELESS_PX = 5.0, 15.0
+# How much of its drift is left to what moves as most of the thread does.
+_TOGETHER = 0.2
+_ANYWHERE_PX, _HOPELESS_PX, _MOVED_PX = 5.0, 15.0, 2.0
 _GAP = 5
 _BORDER_PX = 10.0
 
@@ -130,11 +132,19 @@ class Doubt:
     """How far what is not seen may have moved away, px, at evenly spaced parameters.
 
     It grows with the curve's own motion there: a hidden stretch of a thread at rest stays where it
-    was, one that was moving fast may be anywhere.
+    was, and one that moves as the rest does goes on with it; one that was moving fast by itself may be
+    anywhere.
     """
 
     def __init__(self) -> None:
         self.px: Float64 = np.zeros(RELIABILITY_SAMPLES)
+
+    @classmethod
+    def everywhere(cls) -> Doubt:
+        """All may have moved, though not far: what is not seen at once is doubtful soon."""
+        doubt = cls()
+        doubt.px[:] = _MOVED_PX
+        return doubt
 
     def grow(
         self, before: Nurbs, predicted: Nurbs, after: Nurbs, seen: Bool, rig: StereoRig
@@ -145,7 +155,11 @@ class Doubt:
         places = [rig.project(values_at(curve, s))[0] for curve in curves]
         both = views(rig, values_at(after, s), values_at(after, s, 1))
         outside = ~np.all([view.inside(rig.image_size, _BORDER_PX) for view in both], axis=0)
-        moved = np.linalg.norm(places[2] - places[0], axis=1)
+        steps = places[2] - places[0]
+        moved = np.linalg.norm(steps, axis=1)
+        if seen.any():
+            along = np.linalg.norm(steps - np.median(steps[seen], axis=0), axis=1)
+            moved = np.minimum(moved, along + _TOGETHER * moved)
         surprise = np.linalg.norm(places[2] - places[1], axis=1)
         if seen.any():
             surprise = np.interp(s, s[seen], surprise[seen])

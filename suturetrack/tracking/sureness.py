@@ -13,6 +13,8 @@ SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
 # Votes for a curve that make it sure, in those of a look that is just sure by itself.
 _ENOUGH = 1.5
+# And those that the look by which another curve was voted down has to have more.
+_PLENTY = 3.0
 # Two looks see the same if they are nowhere further apart, and another thing if they are somewhere.
 _SAME_PX, _OTHER_PX = 5.0, 15.0
 # How much the thread has to bend between two looks that both count.
@@ -68,8 +70,8 @@ class Sureness:
             return False
         agrees = apart < _SAME_PX
         self._votes += _votes(confidence) if agrees else -_votes(confidence)
-        self.is_sure = agrees and self._votes >= _ENOUGH
         is_outvoted = self._votes < 0
+        self.is_sure = self._votes >= _ENOUGH if agrees else -self._votes >= _PLENTY
         self._votes, self._shape = abs(self._votes), places[0 if is_outvoted else 1]
         return is_outvoted
 

@@ -13,7 +13,7 @@ from suturetrack.nurbs import evaluate
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.looks import Look, Outcome
 from suturetrack.tracking.pursuit import Pursuit
-from suturetrack.tracking.recovery import Setup
+from suturetrack.tracking.recovery import Setup, has_length
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.tracking.searches import Again, Closer, FromSeed, Search
 from suturetrack.tracking.strands import Neighbours
@@ -164,7 +164,7 @@ class Thread:
         elif outcome.pursuit is None or outcome.pursuit.lies_on(others):
             return
         elif isinstance(search, Again):
-            self._take_again(outcome)
+            self._take_again(outcome, search.known_length)
         else:
             self._take_closer(search, outcome)
 
@@ -178,13 +178,17 @@ class Thread:
         self._seeded_at = _nearest(outcome.found.curve, self._seed, self._setup.rig)
         self._hold(outcome, "found")
 
-    def _take_again(self, outcome: Outcome) -> None:
+    def _take_again(self, outcome: Outcome, known_length: float | None) -> None:
         """A thread that is held still gives way only to a curve that is sure."""
         assert outcome.pursuit is not None
         assert outcome.state is not None
+        if outcome.state.curve is None:
+            return
         is_sure = outcome.pursuit.confidence >= SURE
         is_worse = self._state.status is not Status.TRACKING and (is_sure or not self.is_held)
-        if is_worse and outcome.state.status is Status.TRACKING:
+        # What is followed may have shrunk from what was found.
+        is_whole = has_length(outcome.state.curve, known_length)
+        if is_worse and is_whole and outcome.state.status is Status.TRACKING:
             self._hold(outcome, "found again")
 
     def _take_closer(self, search: Closer, outcome: Outcome) -> None:
