@@ -29,6 +29,8 @@ from suturetrack.types import (
 
 _RECENT_FRAMES = 3
 """Frames in which a thread hardly moves."""
+_SEEN = 0.5
+"""Share of a curve that must be seen to tell the thread's colour."""
 
 
 @dataclass(frozen=True)
@@ -96,10 +98,14 @@ class _Held:
         """Names of those of which nothing was learned yet."""
 
     def seeds(self, now: Stamp) -> Iterator[Seed]:
-        """A place on every further thread that was seen a moment ago."""
+        """A place on every further thread that was seen a moment ago.
+
+        Without its colour the tracker may hold a thread and yet not be sure of it.
+        """
         while (state := self._states.get(0)) is not None:
             recent = now.frame - state.stamp.frame <= _RECENT_FRAMES
-            if recent and state.status is Status.TRACKING and state.thread in self.threads:
+            is_seen = state.status is not Status.LOST and np.mean(state.seen) > _SEEN
+            if recent and is_seen and state.thread in self.threads:
                 self.threads.remove(state.thread)
                 yield _seed_on(scaled(state, 1 / self._rig.metres_per_unit))
 

@@ -9,10 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services import topics
+from services import segmenter, topics
 from services.adaptation import Adaptation
 from services.bus import Bus
 from services.memory_transport import Hub
+from services.segmenter import SegmenterConfig
+from services.service import ServiceConfig
 from services.sources import InputConfig
 from services.wire import scaled
 from suturetrack import nurbs
@@ -29,7 +31,7 @@ from suturetrack.types import (
     StereoFrame,
     ThreadState,
 )
-from tests.test_tiny import bits, play
+from tests.test_tiny import Rig, bits, play
 
 
 @pytest.fixture(scope="module")
@@ -134,3 +136,39 @@ def test_lock_step_adapts_the_same_twice_to_the_bit(monkeypatch: pytest.MonkeyPa
     states = [[bits(state) for state in outcome.states] for outcome, _ in runs]
     assert adapted == 2 * [0, 8]
     assert states[0] == states[1]
+
+
+@pytest.mark.parametrize(
+    ("status", "seen", "learns"),
+    [
+        (Status.TRACKING, True, True),
+        (Status.OCCLUDED, True, True),
+        (Status.OCCLUDED, False, False),
+        (Status.LOST, True, False),
+    ],
+)
+def test_a_segmenter_that_is_started_again_learns_from_what_is_seen_of_a_thread(
+    scenes: tuple[Scene, Scene], status: Status, seen: bool, learns: bool
+) -> None:
+    """Of a thread of which nobody is sure, too: without its colour nobody may ever be."""
+    desk, rig, config = Desk(scenes), Rig(), ServiceConfig(resume=1)
+    camera, tracker = rig.connect("source"), rig.connect("tracker")
+    camera.answer(topics.CALIBRATION, lambda _: desk.rig)
+    fields = camera.every(topics.FIELD)
+    state = replace(state_of(desk.curve, Stamp(0, 0, 0), status), seen=np.full(64, seen))
+    message = scaled(state, desk.rig.metres_per_unit)
+    camera.keep(topics.STATE)
+    tracker.publish(topics.STATE, message)
+    tracker.declare_alive()
+    rig.start("segmenter", segmenter, SegmenterConfig(config))
+    assert camera.wait_for_alive("segmenter", 60)
+    shown = []
+    for index in range(2):
+        camera.publish(topics.FRAME, StereoFrame(Stamp(index, 0, 0), *desk.images))
+        field = fields.get(20)
+        assert field is not None
+        shown.append(field.left.tobytes())
+        tracker.publish(topics.STATE, replace(message, stamp=Stamp(index, 0, 0)))
+    rig.stop()
+    assert not rig.errors
+    assert (shown[0] != shown[1]) is learns
