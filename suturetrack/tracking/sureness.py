@@ -59,6 +59,12 @@ class Sureness:
         self._looks, self._last_ns = self._looks + 1, now_ns
         return True
 
+    def revoke(self, now_ns: int) -> None:
+        """Makes what was sure open again: looks have to tell."""
+        if self.is_sure:
+            self.is_sure, self._votes = False, 0.0
+            self._looks, self._last_ns = 0, now_ns
+
     def weigh(self, confidence: float, found: Nurbs, followed: Nurbs) -> bool:
         """Adds a look; whether what it found, in the direction of what is followed, takes its place."""
         places = self._outline(found), self._outline(followed)

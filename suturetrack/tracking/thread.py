@@ -17,6 +17,7 @@ from suturetrack.tracking.recovery import Setup, has_length
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.tracking.searches import Again, Closer, FromSeed, Search
 from suturetrack.tracking.strands import Neighbours
+from suturetrack.tracking.strangers import Strangers
 from suturetrack.tracking.sureness import SURE, Sureness
 from suturetrack.types import Energies, Float64, Nurbs, RidgeField, Seed, Stamp, Status, ThreadState
 
@@ -51,6 +52,7 @@ class Thread:
         self._state = self._followed = last or not_found(seed.thread, Stamp(0, 0, 0), ())
         self._pursuit: Pursuit | None = None
         self._sureness: Sureness | None = None
+        self._strangers = Strangers()
         self._was_sure = last is not None
         self._seeded_at = 0.5
         self._rest = self._failures = 0
@@ -80,8 +82,13 @@ class Thread:
         events = self._state.events if is_new else ("not newer than the last field",)
         return replace(self._state, stamp=stamp, events=events)
 
-    def follow(self, field: RidgeField, others: Neighbours) -> None:
-        """Goes on to the next field, as far as the thread can be followed."""
+    def follow(self, field: RidgeField, others: Neighbours, all_held: bool) -> None:
+        """Goes on to the next field, as far as the thread can be followed.
+
+        Args:
+            others: strands of the other threads that are held.
+            all_held: whether these are all; what moves may be one that is not held.
+        """
         was_lost = not self.is_held
         if self._pursuit is None:
             self._state = replace(self._state, events=())
@@ -91,14 +98,32 @@ class Thread:
             state = replace(state, events=("recovered", *state.events))
         elif state.status is Status.LOST and not was_lost:
             state = replace(state, events=("lost", *state.events))
+        if state.status is not Status.LOST and all_held:
+            self._look_for_strangers(state, field, others)
+        else:
+            self._strangers = replace(self._strangers, is_found=False)
         self._come_to(state)
         if self.is_held and not self._is_uncertain:
             self._rest = self._failures = 0
+
+    def _look_for_strangers(
+        self, state: ThreadState, field: RidgeField, others: Neighbours
+    ) -> None:
+        """Where the thread may have left the curve, nothing that was sure of the curve still is."""
+        assert self.follower is not None
+        assert self._sureness is not None
+        model, rig = self.follower.model, self.follower.rig
+        self._strangers = self._strangers.step(
+            model.curve, state.seen, field, rig, model.levels, others
+        )
+        if self._strangers.is_found:
+            self._sureness.revoke(field.stamp.capture_ns)
 
     def _come_to(self, state: ThreadState) -> None:
         """What is not sure to be the thread is not called so."""
         self._followed = state
         is_sure = self._sureness is not None and self._sureness.is_sure
+        is_sure &= not self._strangers.is_found
         self._was_sure |= is_sure
         if state.status is Status.TRACKING and not is_sure:
             state = replace(state, status=Status.OCCLUDED)

@@ -114,7 +114,8 @@ class Tracker:
             dated = replace(field, stamp=replace(field.stamp, capture_ns=self._clock.now_ns))
             held = {name for name, thread in self._threads.items() if thread.is_held}
             for thread in threads:
-                thread.follow(dated, self._others(thread, dated))
+                all_held = not self._threads.keys() - held - {thread.name}
+                thread.follow(dated, self._others(thread, dated), all_held)
             done = [*self._go_on_looking(dated), *self._begin_to_look(dated, held)]
         states = [thread.state_at(field.stamp, is_new) for thread in threads]
         first = {look.thread: look for look in done if isinstance(look.search, FromSeed)}

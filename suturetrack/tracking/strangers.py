@@ -1,0 +1,172 @@
+"""Ridges that branch off the curve and move: where the thread runs if the curve follows something else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from suturetrack.camera import StereoRig
+from suturetrack.kernels import search
+from suturetrack.metrics import polyline_length
+from suturetrack.tracking.sampling import View, values_at, views
+from suturetrack.tracking.strands import Neighbours
+from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField
+
+UInt8 = NDArray[np.uint8]
+
+_PLACES = 96
+# What has moved is where no ridge was at some time in the last seconds, looked at so often.
+_PAUSE_NS, _REMEMBERED_NS = 200_000_000, 3_000_000_000
+# Responses of a ridge and of nothing, as parts of a clear view of the thread.
+_RIDGE, _NOTHING = 0.5, 0.25
+_WIDEST_PX = 24
+# What is nearer than this to the rim of the thread may be its own; a branch begins and goes further
+# away than that.
+_OWN_PX, _TOUCHES_PX, _LEAVES_PX = 2.0, 5.0, 6.0
+# Length of a branch, and its distance from the ends, in distances of what may be the thread's own.
+_LONG, _FROM_ENDS = 5.0, 5.0
+# How far around the curve is looked, in the same.
+_MARGIN = 12.0
+# Branches that begin within so many such distances of one another are the same one in both views, and
+# one that crosses the curve on both sides of it; what lies still has to begin nearer on the other side.
+_SAME, _ACROSS = 12.0, 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Strangers:
+    """What of the last seconds' fields shows which ridges have moved.
+
+    A thread that moves past a vein leaves it where it was. A curve that runs along the vein instead
+    leaves the thread out: a ridge that begins at the curve, leaves it to one side, and was not there
+    before. What goes on at the other side only crosses the curve.
+    """
+
+    is_found: bool = False
+    """Whether a ridge that has moved branches off the curve, in both views."""
+    _past: tuple[tuple[int, tuple[UInt8, UInt8]], ...] = ()
+    """Capture times and where there were ridges, left and right, a bit for each pixel."""
+
+    def step(
+        self,
+        curve: Nurbs,
+        seen: Bool,
+        field: RidgeField,
+        rig: StereoRig,
+        levels: tuple[float, float],
+        others: Neighbours,
+    ) -> Strangers:
+        """With the next field; most fields change nothing.
+
+        Args:
+            seen: at evenly spaced parameters.
+            levels: response of a clear view of the thread, left and right.
+            others: other threads, left and right.
+        """
+        now = field.stamp.capture_ns
+        if self._past and 0 <= now - self._past[-1][0] < _PAUSE_NS:
+            return self
+        past = tuple(then for then in self._past if 0 <= now - then[0] < _REMEMBERED_NS)
+        s = np.linspace(0, 1, _PLACES)
+        both = views(rig, values_at(curve, s), values_at(curve, s, 1))
+        shown = np.interp(s, np.linspace(0, 1, len(seen)), seen) > 0.5
+        branches: list[Bool] = []
+        ridges = []
+        for side, (image, view) in enumerate(zip((field.left, field.right), both, strict=True)):
+            power = np.einsum("ijk,ijk->ij", image, image) / np.float32(levels[side] ** 2)
+            ridges.append(_packed(power))
+            if past and (side == 0 or branches[0].any()):
+                always = np.bitwise_and.reduce([then[1][side] for then in past])
+                stayed = np.unpackbits(always, axis=1, count=power.shape[1])
+                own_px = _half_width(image, view, levels[side]) + _OWN_PX
+                crop = _around(view.pixels, power.shape, _MARGIN * own_px)
+                corner = np.array([crop[1].start, crop[0].start], float)
+                near = replace(view, pixels=view.pixels - corner)
+                known = others[side].pixels - corner
+                found = _branches(power[crop], stayed[crop], near, shown, known, own_px)
+                branches.append(found)
+        is_found = len(branches) == 2 and bool((branches[0] & branches[1]).any())
+        return Strangers(is_found, (*past, (now, (ridges[0], ridges[1]))))
+
+
+def _packed(power: Float32) -> UInt8:
+    ridges = cv2.dilate((power > _NOTHING**2).astype(np.uint8), np.ones((3, 3), np.uint8))
+    return np.packbits(ridges, axis=1)
+
+
+def _around(pixels: Float64, shape: tuple[int, ...], margin: float) -> tuple[slice, slice]:
+    """Rows and columns of the image that hold the curve and its surroundings."""
+    size = np.array(shape[1::-1])
+    low = np.clip(pixels.min(axis=0) - margin, 0, size - 1).astype(int)
+    high = np.clip(pixels.max(axis=0) + margin, low + 1, size).astype(int)
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def _half_width(image: Float32, view: View, level: float) -> float:
+    """How far from its middle the thread's ridge reaches, px."""
+    offsets: Float64 = np.arange(_WIDEST_PX + 1.0)
+    profile = np.median(search.normal_profiles(image, view.pixels, view.tangents, offsets), axis=0)
+    return float(np.argmax(profile < _NOTHING * level))
+
+
+def _branches(
+    power: Float32, stayed: UInt8, view: View, seen: Bool, others: Float64, own_px: float
+) -> Bool:
+    """(k,) places of the curve near which ridges that have moved branch off it to one side.
+
+    Args:
+        power: (H, W) squared response, against a clear view of the thread.
+        stayed: (H, W) where there always was a ridge.
+        others: (m, 2) pixels of other threads.
+        own_px: what is nearer to the curve is its own ridge.
+    """
+    away = _distances(power.shape, view.pixels, others)
+    ridge = ((power > _RIDGE**2) & (away > own_px)).astype(np.uint8)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(ridge)
+    shape = 2, len(view.pixels)
+    touched, moved = np.zeros(shape, bool), np.zeros(shape, bool)
+    for label in range(1, count):
+        left, top, width, height, _ = boxes[label]
+        if max(width, height) < _LEAVES_PX - _OWN_PX:
+            continue
+        box = slice(top, top + height), slice(left, left + width)
+        piece = labels[box] == label
+        if away[box][piece].max() < own_px + _LEAVES_PX - _OWN_PX:
+            continue
+        begins = np.argwhere(piece & (away[box] < own_px + _TOUCHES_PX - _OWN_PX))
+        there = begins[:, None, ::-1] + [left, top] - view.pixels
+        gaps = np.linalg.norm(there, axis=2)
+        beside = np.flatnonzero(gaps.min(axis=1) < own_px + _TOUCHES_PX)
+        places = gaps[beside].argmin(axis=1)
+        is_left = np.sum(there[beside, places] * view.normals[places], axis=1) > 0
+        touched[is_left.astype(int), places] = True
+        new = np.argwhere(piece & (stayed[box] == 0))
+        if len(new) and np.linalg.norm(np.ptp(new, axis=0)) > _LONG * own_px:
+            moved[is_left.astype(int), places] = True
+    spacing = max(polyline_length(view.pixels), 1.0) / (shape[1] - 1)
+    same, across = (round(times * own_px / spacing) for times in (_SAME, _ACROSS))
+    one_sided = [
+        moved[side] & ~_widened(moved[1 - side], same) & ~_widened(touched[1 - side], across)
+        for side in (0, 1)
+    ]
+    ends = np.linalg.norm(view.pixels[:, None] - view.pixels[[0, -1]], axis=2).min(axis=1)
+    may_be = seen & (ends > _FROM_ENDS * own_px)
+    return _widened((one_sided[0] | one_sided[1]) & may_be, same)
+
+
+def _widened(flags: Bool, reach: int) -> Bool:
+    size = min(2 * reach + 1, len(flags))
+    return np.asarray(np.convolve(flags, np.ones(size), "same") > 0.5)
+
+
+def _distances(shape: tuple[int, ...], curve: Float64, others: Float64) -> Float32:
+    """(H, W) px to the curve or to another thread, whichever is nearer."""
+    free = np.full(shape, 255, np.uint8)
+    points = np.round(8 * curve).astype(np.int32)
+    cv2.polylines(free, [points], False, 0, 1, cv2.LINE_8, 3)
+    inside = np.all((others >= 0) & (others <= np.array(shape[::-1]) - 1), axis=1)
+    u, v = np.round(others[inside]).astype(int).T
+    free[v, u] = 0
+    return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 3), np.float32)
