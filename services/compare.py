@@ -118,9 +118,15 @@ def show(summaries: list[RunSummary], distances: list[Distances], console: Conso
 def exceeded(
     summaries: list[RunSummary], distances: list[Distances], config: CompareConfig
 ) -> list[str]:
-    """What is out of tolerance, in words."""
-    excess = []
+    """What is out of tolerance, in words; what cannot be compared is."""
+    excess: list[str] = []
+    if config.tolerance_mm is None and config.tolerance_tracking is None:
+        return excess
+    if not summaries[0].threads:
+        return [f"{summaries[0].name}: no thread was seeded, there is nothing to compare with"]
     if config.tolerance_mm is not None:
+        for summary in summaries[1:]:
+            excess += _not_compared(summaries[0], summary, distances)
         for d in distances:
             largest = Spread.of(d.mm).largest
             if largest > config.tolerance_mm:
@@ -130,6 +136,15 @@ def exceeded(
         for summary in summaries[1:]:
             excess += _less_tracking(summaries[0], summary, config.tolerance_tracking)
     return excess
+
+
+def _not_compared(first: RunSummary, other: RunSummary, distances: list[Distances]) -> list[str]:
+    compared = {d.thread for d in distances if d.run == other.name and np.isfinite(d.mm).any()}
+    missing = [t.thread for t in first.threads if t.thread not in compared]
+    return [
+        f"{other.name}: thread {thread} has no curve at the frames of {first.name}"
+        for thread in missing
+    ]
 
 
 def _less_tracking(first: RunSummary, other: RunSummary, tolerance: float) -> list[str]:

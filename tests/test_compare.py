@@ -66,3 +66,15 @@ def test_fewer_tracked_frames_fail_their_tolerance(runs: tuple[Path, Path, Path]
 def test_one_run_is_nothing_to_compare(runs: tuple[Path, Path, Path]) -> None:
     with pytest.raises(InputError, match="two or more"):
         run(CompareConfig(runs[:1]))
+
+
+def test_a_thread_that_a_run_lacks_fails_the_check(
+    tmp_path: Path, runs: tuple[Path, Path, Path], rig: StereoRig
+) -> None:
+    with Recorder(tmp_path / "empty", "tracker", "light", rig) as recorder:
+        recorder.states([], published_ns=10**18)
+    run(CompareConfig((runs[0], tmp_path / "empty")))
+    with pytest.raises(SystemExit, match=r"empty: thread 0 has no curve at the frames of first"):
+        run(CompareConfig((runs[0], tmp_path / "empty"), tolerance_mm=1.0))
+    with pytest.raises(SystemExit, match="empty: no thread was seeded"):
+        run(CompareConfig((tmp_path / "empty", runs[0]), tolerance_tracking=5.0))
