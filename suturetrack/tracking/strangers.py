@@ -45,7 +45,9 @@ class Strangers:
     """
 
     is_found: bool = False
-    """Whether a ridge that has moved branches off the curve, in both views."""
+    """Whether a ridge that has moved branches off the curve, in both views, at two looks in a row."""
+    _suspected: bool = False
+    """The same at the last look alone: a curve may be off in a single field that is blurred."""
     _past: tuple[tuple[int, tuple[UInt8, UInt8]], ...] = ()
     """Capture times and where there were ridges, left and right, a bit for each pixel."""
 
@@ -87,8 +89,9 @@ class Strangers:
                 known = others[side].pixels - corner
                 found = _branches(power[crop], stayed[crop], near, shown, known, own_px)
                 branches.append(found)
-        is_found = len(branches) == 2 and bool((branches[0] & branches[1]).any())
-        return Strangers(is_found, (*past, (now, (ridges[0], ridges[1]))))
+        suspected = len(branches) == 2 and bool((branches[0] & branches[1]).any())
+        is_found = suspected and self._suspected
+        return Strangers(is_found, suspected, (*past, (now, (ridges[0], ridges[1]))))
 
 
 def _packed(power: Float32) -> UInt8:
