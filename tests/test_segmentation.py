@@ -623,9 +623,26 @@ def test_the_key_shows_every_direction_in_its_colour() -> None:
         np.testing.assert_allclose(key[v, u], expected, atol=12)
 
 
-@pytest.mark.parametrize("hard", [True, False])
-def test_a_thread_is_taken_for_cut_out_where_its_rim_is_hard(hard: bool) -> None:
+@pytest.mark.parametrize(
+    ("rim", "pale", "noise", "shadow", "expected"),
+    [
+        pytest.param(100.0, 1.0, 0.0, 0.0, True, id="hard rims"),
+        pytest.param(100.0, 1.0, 12.0, 0.0, True, id="hard rims and noise"),
+        pytest.param(2.0, 1.0, 0.0, 0.0, False, id="through a lens"),
+        pytest.param(2.0, 1.0, 3.0, 0.0, False, id="through a lens, with noise"),
+        pytest.param(2.0, 0.2, 0.0, 0.0, True, id="enlarged, with highlights"),
+        pytest.param(2.0, 0.2, 0.0, 0.4, False, id="on paper, with a shadow"),
+    ],
+)
+def test_a_thread_is_taken_for_cut_out_where_its_shades_say_nothing(
+    rim: float, pale: float, noise: float, shadow: float, expected: bool
+) -> None:
+    """Through a lens, on white, its shades tell its middle better than a hard outline."""
     row = np.abs(np.arange(100) - 50.2)[:, None] + np.zeros((1, 120))
-    share = (row < 2).astype(float) if hard else expit(2 * (2 - row))
-    left = np.rint(255 - 150 * share).astype(np.uint8)
-    assert is_cut_out(StereoFrame(STAMP, left, left)) == hard
+    shades = np.where(np.arange(120) % 40 < 8, pale, 1.0) * expit(rim * (3 - row))
+    shades = np.maximum(shades, shadow * expit((14 - row) / 3))
+    rng = np.random.default_rng(0)
+    image = 255 - 150 * shades + noise * rng.standard_normal(shades.shape)
+    left = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    assert is_cut_out(StereoFrame(STAMP, left, left)) == expected
+    assert is_cut_out(StereoFrame(STAMP, 255 - left, 255 - left)) == expected
