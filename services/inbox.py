@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Iterator
 from typing import Generic, TypeVar
@@ -20,19 +21,31 @@ class Stop:
     def __init__(self) -> None:
         # Entered by itself: an interrupt on the way into a Condition would leave it locked.
         self.lock = threading.RLock()
-        self.condition = threading.Condition(self.lock)
         self.is_set = False
+        self._conditions: weakref.WeakSet[threading.Condition] = weakref.WeakSet()
+        self._stopped = self.condition()
+
+    def condition(self) -> threading.Condition:
+        """A condition of `lock` that is notified when the process is asked to stop, too.
+
+        Each who waits has one, so that a message wakes nobody but its reader.
+        """
+        condition = threading.Condition(self.lock)
+        with self.lock:
+            self._conditions.add(condition)
+        return condition
 
     def set(self) -> None:
         """Ends all waiting, now and later; not to be called from a signal handler."""
         with self.lock:
             self.is_set = True
-            self.condition.notify_all()
+            for condition in self._conditions:
+                condition.notify_all()
 
     def wait(self, seconds: float) -> bool:
         """Sleeps, at most until stopped; whether it was stopped."""
         with self.lock:
-            return self.condition.wait_for(lambda: self.is_set, seconds)
+            return self._stopped.wait_for(lambda: self.is_set, seconds)
 
 
 class Inbox(Generic[T]):
@@ -43,6 +56,7 @@ class Inbox(Generic[T]):
 
     def __init__(self, stop: Stop, depth: int):
         self._stop = stop
+        self._arrival = stop.condition()
         self._items: deque[T] = deque()
         self._depth = depth
         self.received = 0
@@ -61,7 +75,7 @@ class Inbox(Generic[T]):
                 self._items.popleft()
                 self.given_up += 1
             self._items.append(item)
-            self._stop.condition.notify_all()
+            self._arrival.notify()
 
     def get(self, timeout: float | None = None) -> T | None:
         """The next message; None after `timeout` seconds without one, or when asked to stop."""
@@ -71,7 +85,7 @@ class Inbox(Generic[T]):
                 left = None if deadline is None else deadline - time.monotonic()
                 if left is not None and left <= 0:
                     return None
-                self._stop.condition.wait(min(left or _LONGEST_WAIT_S, _LONGEST_WAIT_S))
+                self._arrival.wait(min(left or _LONGEST_WAIT_S, _LONGEST_WAIT_S))
             return None if self._stop.is_set else self._items.popleft()
 
     def __iter__(self) -> Iterator[T]:
