@@ -23,6 +23,8 @@ for _name in _ONE_THREAD:
 # What is wrong with a video is said once, by us.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+# Rerun warns of every file without a footer, which ours are on purpose.
+os.environ.setdefault("RUST_LOG", "error")
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,6 @@ RECORDING_VERSION = 1
 
 _log = logging.getLogger(__name__)
 _LONGEST_FLUSH_SECONDS = 4.0
-LONGEST_PART_S = 240.0
-"""Rerun keeps an index of an open file in memory: some 30 MB a minute of a thread."""
 
 
 class RunFile(Writer):
@@ -73,7 +71,7 @@ class RunFile(Writer):
         super().__init__(stream, process, level, rig)
         self._config, self._run_dir = config, run_dir
         self._flush_seconds, self._part_bytes = flush_seconds, part_bytes
-        self._flushed = self._opened = time.monotonic()
+        self._flushed = time.monotonic()
         try:
             run_dir.mkdir(parents=True, exist_ok=True)
             self._open_part(stream)
@@ -104,8 +102,7 @@ class RunFile(Writer):
         try:
             self.columns.send()
             stream.flush(timeout_sec=_LONGEST_FLUSH_SECONDS)
-            full = self._path.stat().st_size >= self._part_bytes
-            if full or time.monotonic() - self._opened > LONGEST_PART_S:
+            if self._path.stat().st_size >= self._part_bytes:
                 self._open_part(stream)
         except FileNotFoundError:
             return "the file or its folder was removed"
@@ -119,8 +116,10 @@ class RunFile(Writer):
         while name.exists():
             number += 1
             name = self._run_dir / f"{self.process}.{number}.rrd"
-        self._path, self._opened = name, time.monotonic()
-        stream.set_sinks(rr.FileSink(str(name)), default_blueprint=self.layout())
+        self._path = name
+        # The index that a footer is would grow in memory, by 20 MB a minute of a thread.
+        sink = rr.FileSink(str(name), write_footer=False)
+        stream.set_sinks(sink, default_blueprint=self.layout())
         stream.send_recording_name(self._run_dir.name)
         self.describe()
         self.write_static(self._about())

@@ -243,7 +243,7 @@ def rerun_program() -> Path:
 
 def _reader(file: Path) -> tuple[RrdReader | None, str]:
     with warnings.catch_warnings():
-        # Without the footer that a killed process could not write, the file is scanned.
+        # Without a footer, the file is scanned.
         warnings.simplefilter("ignore")
         try:
             reader = RrdReader(file)

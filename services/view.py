@@ -55,7 +55,9 @@ def run(config: ViewConfig) -> None:
     folder = RunFolder(config.run_dir)
     for problem in folder.problems:
         print(f"view: {problem}", file=sys.stderr)
-    status = subprocess.run(command(config.web, *files(folder)), check=False).returncode
+    status = subprocess.run(
+        command(config.web, *files(folder)), env=_surroundings(), check=False
+    ).returncode
     if status:
         raise InputError(f"the Rerun viewer ended with status {status}")
 
@@ -65,7 +67,9 @@ def _follow(bus: Bus, web: bool) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    window = subprocess.Popen(command(web, "--port", str(port), "--hide-welcome-screen"))
+    window = subprocess.Popen(
+        command(web, "--port", str(port), "--hide-welcome-screen"), env=_surroundings()
+    )
     try:
         rig = None
         while rig is None and window.poll() is None and not bus.stop.is_set:
@@ -92,3 +96,8 @@ def command(web: bool, *arguments: str) -> list[str]:
     """The viewer's own command line."""
     options = ["--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
     return [str(rerun_program()), *options, *arguments]
+
+
+def _surroundings() -> dict[str, str]:
+    """The viewer's environment: what it says, such as where its page is, is for the user."""
+    return {**os.environ, "RUST_LOG": "info"}

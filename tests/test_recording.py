@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
 
 from services.drawing import Level
 from services.messages import Health, Latency
@@ -155,14 +156,15 @@ def test_the_direction_picture_lies_on_the_raw_image(
 @pytest.mark.parametrize(
     ("level", "pictured"), [("light", [0, 3, 8, 11]), ("full", [0, 1, 2, 3, 8, 9, 10, 11])]
 )
-def test_light_recordings_keep_a_picture_of_every_third_field(
+def test_light_recordings_keep_ten_pictures_of_the_field_a_second(
     tmp_path: Path, rig: StereoRig, ridges: RidgeField, level: Level, pictured: list[int]
 ) -> None:
     """Latencies are there at every frame; where frames were dropped, the next picture is not late."""
     frames = [0, 1, 2, 3, 8, 9, 10, 11]
     with Recorder(tmp_path, "segmenter", level, rig) as recorder:
         for i in frames:
-            recorder.field(replace(ridges, stamp=Stamp(i, i, i)), i + 1_000_000)
+            at_ns = i * 33_333_333
+            recorder.field(replace(ridges, stamp=Stamp(i, at_ns, at_ns)), at_ns + 1_000_000)
     folder = RunFolder(tmp_path)
     pictures = rows(folder, "/rig/left/image/direction")
     assert sorted(r["frame"] for r in pictures) == pictured
@@ -392,7 +394,9 @@ def test_a_long_run_rolls_over_into_parts_that_each_explain_themselves(
         folder = RunFolder(alone)
         assert folder.rig().focal == rig.focal
         assert [r for r in folder.rows("/plots/0/length") if "SeriesLines:names" in r]
-        assert len(RrdReader(part).recordings()) == 1
+        # A footer would be an index that grows in memory.
+        with pytest.warns(RerunWarning, match="no footer"):
+            assert len(RrdReader(part).recordings()) == 1
 
 
 def test_a_removed_folder_stops_the_recording_and_nothing_else(

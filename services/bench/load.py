@@ -23,7 +23,6 @@ from services.bench import report
 from services.bench.system import ROLES, System, film, private_folder, rig_name
 from services.client import Seen
 from services.messages import Health
-from services.run_file import LONGEST_PART_S
 
 Measure = Callable[[str, float, float], "Row"]
 
@@ -88,7 +87,7 @@ class Row:
     memory_mb: float
     """Of all processes together, at the end."""
     memory_percent_per_10_min: float
-    """Its growth, over whole parts of the recordings where there are two; nan after less than a minute."""
+    """Its growth, by a line through the second half; nan after less than a minute."""
     source_mb_per_10_min: float
     """The same growth process by process, in MB."""
     segmenter_mb_per_10_min: float
@@ -219,17 +218,8 @@ def _row(load: str, fps: float, watch: _Watch, from_ns: int, missed: int) -> Row
 
 
 def _growth_mb(memory: list[tuple[float, dict[str, float]]], process: str) -> float:
-    """Of a process in ten minutes: from the last part of its recording but one to the last.
-
-    The index of a part grows and is freed at its end. A shorter soak is judged by a line through its
-    second half.
-    """
-    times, used = np.array([(when, mb[process]) for when, mb in memory]).T
-    ago = times[-1] - times
-    if ago[0] >= 2 * LONGEST_PART_S:
-        last, before = ago < LONGEST_PART_S, (ago >= LONGEST_PART_S) & (ago < 2 * LONGEST_PART_S)
-        return 600 / LONGEST_PART_S * float(used[last].mean() - used[before].mean())
-    later = slice(len(times) // 2, None)
-    if ago[later.start] < _LEAST_FOR_GROWTH_S:
+    """Of a process in ten minutes, by a line through the second half of the soak."""
+    times, used = np.array([(when, mb[process]) for when, mb in memory[len(memory) // 2 :]]).T
+    if times[-1] - times[0] < _LEAST_FOR_GROWTH_S:
         return float("nan")
-    return 600 * float(np.polyfit(times[later], used[later], 1)[0])
+    return 600 * float(np.polyfit(times, used, 1)[0])
