@@ -15,8 +15,9 @@ from suturetrack.initialization import Initialization, initialize
 from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.tracking.control_points import rearrange, refit
 from suturetrack.tracking.gauss_newton import expected
+from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Doubt
 from suturetrack.tracking.sampling import Samples
-from suturetrack.types import RidgeField, Seed, Status, ThreadState
+from suturetrack.types import Nurbs, RidgeField, Seed, Status, ThreadState
 from tests.conftest import make_rig
 from tests.painting import FPS, paint, stamp, thread
 
@@ -254,6 +255,32 @@ def test_an_end_that_leaves_the_image_is_cut_at_the_border(rig: StereoRig) -> No
     assert rig.project(found)[0][:, 0].max() < 642
     visible = truths[-1][u < 636]
     assert metrics.coverage(found, visible, 0.5) > 0.98
+
+
+def test_what_moves_outside_the_images_is_gone_until_it_comes_in(rig: StereoRig) -> None:
+    def swung_out(by: float) -> Nurbs:
+        points = np.stack([np.linspace(0, 150, 8), np.zeros(8), np.full(8, 300.0)], axis=1)
+        points[5:, 1] += by * np.linspace(0, 1, 3)
+        return nurbs.curve_from(3, nurbs.clamped_knots(np.linspace(0, 1, 6)[1:-1], 3), points)
+
+    s = np.linspace(0, 1, RELIABILITY_SAMPLES)
+    pixels = np.stack(rig.project(nurbs.evaluate(swung_out(0.0), s)))
+    seen = np.all(pixels[..., 0] < 628, axis=0)
+    assert 0.5 < seen.mean() < 0.9
+    doubt = Doubt()
+    for i in range(40):
+        before, after = swung_out(5.0 * i), swung_out(5.0 * (i + 1))
+        doubt.grow(before, after, after, seen, rig)
+    assert not doubt.px[seen].any()
+    assert doubt.gone[-5:].all()
+    assert not doubt.gone[seen].any()
+    assert not doubt.anywhere[-5:].any()
+    doubt.cut(0, 0)
+    assert doubt.gone[-5:].all()
+    at_rest = swung_out(0.0)
+    inside = replace(at_rest, control_points=at_rest.control_points - [60.0, 0.0, 0.0])
+    doubt.grow(inside, inside, inside, seen, rig)
+    assert not (doubt.gone | doubt.anywhere).any()
 
 
 def test_two_threads_keep_their_names(rig: StereoRig) -> None:

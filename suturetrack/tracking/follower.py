@@ -202,7 +202,8 @@ class Follower:
         unseen_s = (model.capture_ns - model.seen_ns) * _NS
         uncertain_s = (model.capture_ns - self._certain_ns) * _NS
         status = judge(evidence, unseen_s, uncertain_s)
-        if status is Status.TRACKING and self._makes_detour(plain, evidence):
+        gone = self._doubt.gone.mean() > ASTRAY
+        if status is Status.TRACKING and (gone or self._makes_detour(plain, evidence)):
             status = Status.OCCLUDED
         if self._lost and self._has_changed(plain, evidence):
             status = Status.LOST

@@ -133,11 +133,12 @@ class Doubt:
 
     It grows with the curve's own motion there: a hidden stretch of a thread at rest stays where it
     was, and one that moves as the rest does goes on with it; one that was moving fast by itself may be
-    anywhere.
+    anywhere. What comes into the images is looked for anew.
     """
 
     def __init__(self) -> None:
         self.px: Float64 = np.zeros(RELIABILITY_SAMPLES)
+        self._outside: Bool = np.zeros(RELIABILITY_SAMPLES, bool)
 
     @classmethod
     def everywhere(cls) -> Doubt:
@@ -164,23 +165,30 @@ class Doubt:
         if seen.any():
             surprise = np.interp(s, s[seen], surprise[seen])
         drift = _DRIFT * moved + surprise + _DRIFT_AT_REST_PX
-        self.px = np.where(seen | outside, 0.0, np.hypot(self.px, drift))
+        comes_in = self._outside & ~outside
+        self.px = np.where(seen | comes_in, 0.0, np.hypot(self.px, drift))
+        self._outside = outside
 
     def cut(self, start: int, stop: int) -> None:
         """So many samples were cut off at the ends."""
-        kept = self.px[start : len(self.px) - stop]
-        places = np.linspace(0, len(kept) - 1, len(self.px))
-        self.px = np.interp(places, np.arange(len(kept)), kept)
+        places = np.linspace(start, len(self.px) - 1 - stop, len(self.px))
+        self.px = np.interp(places, np.arange(len(self.px)), self.px)
+        self._outside = self._outside[np.rint(places).astype(int)]
 
     @property
     def anywhere(self) -> Bool:
-        """(k,) what may be anywhere."""
-        return self.px > _ANYWHERE_PX
+        """(k,) what may be anywhere in the images."""
+        return (self.px > _ANYWHERE_PX) & ~self._outside
 
     @property
     def hopeless(self) -> Bool:
-        """(k,) what is surely elsewhere."""
-        return self.px > _HOPELESS_PX
+        """(k,) what is surely elsewhere in the images."""
+        return (self.px > _HOPELESS_PX) & ~self._outside
+
+    @property
+    def gone(self) -> Bool:
+        """(k,) what is surely elsewhere outside the images, where it cannot be looked for."""
+        return (self.px > _HOPELESS_PX) & self._outside
 
 
 def loose_ends(wrong: Bool) -> tuple[int, int]:
