@@ -243,6 +243,28 @@ def test_a_crossing_that_neither_view_can_tell_is_doubtful() -> None:
     assert is_right or any("an ambiguous crossing" in reason for reason in found.reasons)
 
 
+@pytest.mark.parametrize(("gap", "is_doubtful"), [(5.0, False), (1.0, True)])
+def test_an_end_that_is_seen_to_stop_short_of_the_thread_is_not_doubtful(
+    rig: StereoRig, gap: float, is_doubtful: bool
+) -> None:
+    """It comes back to its own side."""
+    angle = np.linspace(0, np.pi, 400)
+    turn = np.c_[np.sin(angle), np.cos(angle)]
+    end = [340.0, 300 - gap]
+    left = np.r_[
+        np.linspace([150.0, 300], [420, 300], 800),
+        [420, 260] + 40 * turn,
+        [380, 260] - 40 * turn[:200],
+        np.linspace([340.0, 260], end, 200),
+    ]
+    views = [draw(left, rig), draw(left - [110, 0], rig)]
+    found = initialize(field_of(*views, rig), rig, Seed(pixel=(200.0, 300.0)))
+    reached = rig.project(dense(found.curve))[0][[0, -1]]
+    assert np.linalg.norm(reached - end, axis=1).min() < 5
+    assert any("beside another ridge" in why for why in found.reasons) == is_doubtful
+    assert (found.confidence < 0.7) == is_doubtful
+
+
 def test_a_highlight_is_bridged(rig: StereoRig, curve: Nurbs) -> None:
     truth = dense(curve)
     views = []

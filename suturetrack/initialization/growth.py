@@ -83,7 +83,8 @@ def follow_thread(
     ridges = replace(ridges, segments=merged.segments)
     entries = _without_faint_ends(ridges, follow(origin, merged.partner), origin)
     doubts = tuple(
-        (ridges.segments[e // 2][-(e % 2)], why, rest) for e, why, rest in merged.doubts(entries)
+        (ridges.segments[e // 2][-(e % 2)], why, rest)
+        for e, why, rest in merged.doubts(entries, ridges)
     )
     pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
     chain = replace(_join(pieces), doubts=doubts)

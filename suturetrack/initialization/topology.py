@@ -25,6 +25,8 @@ _STRAIN = 1.5
 """How much of the confidence is lost with each unit of doubt that is left of the price."""
 _RUNS_ON = 0.55
 """Price of a merge below which an end might as well run on."""
+_GAP, _GAP_SAMPLES = 0.85, 13
+"""Least ||V|| between an end and another strand, against both, below which a gap is seen there."""
 _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""
 _CLEARLY = 0.03
@@ -42,9 +44,9 @@ class Merged:
     price: dict[tuple[int, int], float]
     """Of every pair of ends within reach."""
 
-    def doubts(self, entries: list[int]) -> list[tuple[int, str, float]]:
+    def doubts(self, entries: list[int], ridges: Ridges) -> list[tuple[int, str, float]]:
         """What is doubtful about the thread that enters its segments at `entries`: at which end, why,
-        and what that leaves of the confidence."""
+        and what that leaves of the confidence; `ridges` are those that were merged."""
         within = _within_reach(self.price)
         found = []
         for entry in entries[1:]:
@@ -57,7 +59,7 @@ class Merged:
                 rest = max(1 - _STRAIN * strain, 0.1)
                 found.append((entry, CROSSING, rest))
         for tip in (entries[0], entries[-1] ^ 1):
-            if self._runs_into_another(tip):
+            if self._runs_into_another(tip, entries, ridges):
                 on = min((self.price[tip, j] for j in within.get(tip, ())), default=np.inf)
                 rest = 0.25 if on < _RUNS_ON else 0.4
                 found.append((tip, "an end beside another ridge", rest))
@@ -78,13 +80,29 @@ class Merged:
     def _is_copy(self, one: int, other: int) -> bool:
         return one % 2 == other % 2 and self.segments[one // 2] is self.segments[other // 2]
 
-    def _runs_into_another(self, tip: int) -> bool:
-        segment = self.segments[tip // 2]
-        others = [s for k, s in enumerate(self.segments) if k != tip // 2]
-        others.append(segment[: -2 * ARM] if tip % 2 else segment[2 * ARM :])
-        points = np.concatenate(others)
-        distance = np.linalg.norm(points - segment[-(tip % 2)], axis=1)
-        return bool(len(points) and distance.min() < TOUCHING_PX)
+    def _runs_into_another(self, tip: int, entries: list[int], ridges: Ridges) -> bool:
+        """Whether another ridge is at a tip, or, without a gap before it, the thread itself."""
+        segment, own = self.segments[tip // 2], {e // 2 for e in entries}
+        end = segment[-(tip % 2)]
+        others = [s for k, s in enumerate(self.segments) if k not in own]
+        if others and _nearest(np.concatenate(others), end)[1] < TOUCHING_PX:
+            return True
+        passing = [self.segments[k] for k in own - {tip // 2}]
+        passing.append(segment[: -2 * ARM] if tip % 2 else segment[2 * ARM :])
+        points = np.concatenate(passing)
+        if not len(points):
+            return False
+        nearest, distance = _nearest(points, end)
+        between = ridges.sample(np.linspace(end, nearest, _GAP_SAMPLES))
+        is_joined = between.min() > _GAP * min(between[0], between[-1])
+        return bool(distance < TOUCHING_PX and is_joined)
+
+
+def _nearest(points: Float64, place: Float64) -> tuple[Float64, float]:
+    """Of (k, 2) points the one nearest to a place, and how far it is."""
+    distance = np.linalg.norm(points - place, axis=1)
+    nearest = int(np.argmin(distance))
+    return points[nearest], float(distance[nearest])
 
 
 def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None = None) -> Merged:
