@@ -188,6 +188,11 @@ class Bus:
         return sum(r.dropped for r in self.readers if r.topic.keep == "newest")
 
     @property
+    def newest_waits(self) -> bool:
+        """Whether a frame or field has arrived that the process has not taken yet."""
+        return any(r.waiting for r in self.readers if r.topic.keep == "newest")
+
+    @property
     def refused(self) -> int:
         """Bad messages and questions so far."""
         refused = self.refused_questions + self.refused_kept

@@ -25,6 +25,7 @@ from services.bus import Bus
 from services.checks import check_name
 from services.messages import Health
 from services.meter import Meter
+from services.watchdog import Watchdog
 from services.zenoh_transport import ZenohTransport, load_config, local_config
 from suturetrack import kernels
 from suturetrack.camera import StereoRig
@@ -185,8 +186,10 @@ class Service:
         self.bus.close()
 
     def _beat(self) -> None:
+        watchdog = Watchdog()
         while not self.bus.stop.wait(HEARTBEAT_S):
             health = self.health()
+            watchdog.feed(health, work_waits=self.bus.newest_waits)
             self.bus.publish(topics.HEALTH, health)
             if health.ready:
                 self._unrecorded.append(health)

@@ -10,6 +10,7 @@ import pytest
 import tyro
 
 from services.cli import VERBS
+from services.service import HEARTBEAT_S
 from services.zenoh_transport import load_config
 
 DEPLOY = Path(__file__).parents[1] / "services" / "deploy"
@@ -34,6 +35,15 @@ def test_the_unit_of_a_process_starts_it_to_go_on_where_the_last_one_left_off(pr
     config = tyro.cli(kind, args=[*words[1:-1], *OPTIONS.get(process, [])])
     assert config.service.zenoh == Path(f"/etc/suturetrack/{process}.json5")
     assert config.service.resume == 1
+
+
+def test_the_unit_of_a_process_waits_for_heartbeats() -> None:
+    lines = (DEPLOY / "suturetrack@.service").read_text().splitlines()
+    settings = dict(line.split("=", 1) for line in lines if "=" in line and line[0] != "#")
+    assert settings["Type"] == "notify"
+    assert settings["Restart"] == "always"
+    assert float(settings["WatchdogSec"]) > 5 * HEARTBEAT_S
+    assert float(settings["TimeoutStartSec"]) > 30
 
 
 def test_the_unit_of_the_router_starts_it() -> None:

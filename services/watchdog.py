@@ -1,0 +1,45 @@
+"""What systemd hears of a process that it started: that it runs, and as long as it does not hang.
+
+The protocol of sd_notify; without systemd nothing is said.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from contextlib import suppress
+
+from services.messages import Health
+
+_STILL = 10
+"""Heartbeats, thus seconds, without a frame until a process hangs, while messages wait for it."""
+_BEGINNING = 180
+"""The same until a process is ready, unless it waits for another: kernels may have to be compiled."""
+
+
+class Watchdog:
+    """Is fed at every heartbeat; a loop that hangs leaves the heartbeat alive, but is not fed for."""
+
+    def __init__(self) -> None:
+        self._progress: tuple[int, int, bool] | None = None
+        self._still = 0
+
+    def feed(self, health: Health, *, work_waits: bool) -> None:
+        """To be called with every heartbeat, and whether there are messages that the loop has not taken."""
+        progress = (health.frames, health.refused, health.ready)
+        idle = bool(health.warning) or (health.ready and not work_waits)
+        self._still = 0 if idle or progress != self._progress else self._still + 1
+        self._progress = progress
+        period_s = health.stamp.period_ns / 1e9 if health.stamp else 0.0
+        longest = max(_STILL, _STILL * period_s) if health.ready else _BEGINNING
+        if self._still <= longest:
+            _tell("READY=1\nWATCHDOG=1")
+
+
+def _tell(words: str) -> None:
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if address:
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+            systemd.setblocking(False)
+            # An @ stands for the zero byte with which an abstract name begins.
+            systemd.sendto(words.encode(), address.replace("@", "\0", 1))

@@ -1,0 +1,98 @@
+"""systemd hears of a process as long as it moves, and only then."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from services.messages import Health
+from services.watchdog import Watchdog
+from tests.test_pulse import beat, unready
+
+SAID = b"READY=1\nWATCHDOG=1"
+
+
+class Systemd:
+    """The socket that systemd would listen on."""
+
+    def __init__(self, path: Path):
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(str(path))
+
+    def is_told(self, watchdog: Watchdog, health: Health, *, work_waits: bool = True) -> bool:
+        """Whether a heartbeat feeds the watchdog."""
+        watchdog.feed(health, work_waits=work_waits)
+        self.socket.setblocking(False)
+        try:
+            return self.socket.recv(100) == SAID
+        except BlockingIOError:
+            return False
+
+
+@pytest.fixture
+def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Systemd]:
+    listening = Systemd(tmp_path / "notify")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    with listening.socket:
+        yield listening
+
+
+def test_a_process_that_finishes_frames_or_has_nothing_to_do_is_fed_for(systemd: Systemd) -> None:
+    dog = Watchdog()
+    for second in range(30):
+        assert systemd.is_told(dog, beat("tracker", 30 * second + 1))
+    for _ in range(30):
+        assert systemd.is_told(dog, beat("tracker", 900), work_waits=False)
+    for _ in range(30):
+        assert systemd.is_told(dog, beat("source", 900, warning="no frame for 9 s"))
+
+
+def test_a_process_that_finishes_nothing_while_frames_wait_is_not(systemd: Systemd) -> None:
+    dog = Watchdog()
+    told = [systemd.is_told(dog, beat("tracker", 900)) for _ in range(30)]
+    assert told == 11 * [True] + 19 * [False]
+    assert systemd.is_told(dog, beat("tracker", 901))
+
+
+def test_a_slow_rate_is_no_hang(systemd: Systemd) -> None:
+    dog = Watchdog()
+    for second in range(60):
+        health = beat("tracker", 1 + second // 20, period_ns=20_000_000_000)
+        assert systemd.is_told(dog, health)
+
+
+def test_a_beginning_may_take_longer_but_not_for_ever(systemd: Systemd) -> None:
+    dog = Watchdog()
+    for _ in range(300):
+        assert systemd.is_told(dog, unready("tracker", warning="waits for the source"))
+    told = [systemd.is_told(dog, unready("tracker")) for _ in range(300)]
+    assert told == 180 * [True] + 120 * [False]
+
+
+def test_without_systemd_nothing_is_said(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET")
+    assert not systemd.is_told(Watchdog(), beat("tracker", 1))
+
+
+def test_a_systemd_that_does_not_listen_holds_nobody_up(systemd: Systemd) -> None:
+    dog = Watchdog()
+    for second in range(1000):  # more than wait in a socket
+        dog.feed(beat("tracker", second), work_waits=True)
+    assert systemd.is_told(dog, beat("tracker", 1000))
+
+
+def test_a_real_process_says_that_it_runs(systemd: Systemd, rig_name: str) -> None:
+    systemd.socket.settimeout(30)
+    command = [sys.executable, "-m", "services.cli", "tracker", "--rig", rig_name]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        try:
+            for _ in range(2):
+                assert systemd.socket.recv(100) == SAID
+        finally:
+            process.terminate()
+        assert process.wait(20) == 0
