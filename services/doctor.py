@@ -193,12 +193,11 @@ def _system(watch: RigWatch) -> Iterator[Finding]:
 
 
 def _processes(watch: RigWatch) -> Iterator[Finding]:
-    missing = [n for n in ("source", "segmenter", "tracker") if n not in watch.health]
     subject = f"rig {watch.rig}"
-    if missing:
-        text, advice = f"no {', no '.join(missing)}", f"suturetrack {missing[0]} --rig {watch.rig}"
-        yield Finding(ERROR, subject, text, advice)
-    else:
+    for name in watch.unheard:
+        advice = f"start it: suturetrack {name} --rig {watch.rig}; if it runs, it hangs: kill it"
+        yield Finding(ERROR, subject, f"no {name}", advice)
+    if not watch.unheard:
         yield Finding(OK, subject, ", ".join(sorted(watch.health)))
 
 

@@ -60,6 +60,11 @@ class RigWatch:
         while (state := self._states.get(0)) is not None:
             self.threads[state.thread] = state, self._states.arrived_ns
 
+    @property
+    def unheard(self) -> list[str]:
+        """The processes that every rig needs and of which nothing was heard."""
+        return [name for name in ("source", "segmenter", "tracker") if name not in self.health]
+
     def tables(self) -> list[Table]:
         """The processes, and the threads where there are any."""
         if not self.health:
@@ -85,6 +90,8 @@ class RigWatch:
                 number(health.memory_mb, 0),
                 Text("; ".join(notes), style="yellow"),
             )
+        for name in self.unheard:
+            table.add_row(name, *[""] * (len(columns) - 1), Text("not heard of", style="red"))
         return table
 
     def _threads(self) -> Table:

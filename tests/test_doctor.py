@@ -121,7 +121,8 @@ def test_status_shows_processes_and_threads(rig: Bus, capsys: pytest.CaptureFixt
     watch.close()
     assert watch.health["source"][0].warning == "cable loose"
     assert watch.threads["a"][0].status is Status.LOST
-    assert len(watch.tables()) == 2
+    assert watch.unheard == ["segmenter", "tracker"]
+    assert [table.row_count for table in watch.tables()] == [3, 1]
     assert rig.rig in local_rigs()
     rig.close()
     with pytest.raises(InputError, match=r"no process of rig 'nobody' runs; start some"):
