@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 
 from suturetrack import nurbs
+from suturetrack.camera import StereoRig
 from suturetrack.metrics import polyline_length
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
-from suturetrack.tracking.ends import EndStep, EndWatch, find_end
+from suturetrack.tracking import TrackingConfig, gauss_newton
+from suturetrack.tracking.ends import EndStep, EndWatch, end_shift, find_end
 from suturetrack.tracking.follower import measure_levels
 from suturetrack.types import Nurbs, Seed, Stamp, StereoFrame
+from tests.painting import paint
 
 FRAME_NS = 33_000_000
 PIXEL = 0.0025
@@ -50,6 +53,33 @@ def test_ends_are_found_without_bias_in_what_the_filter_shows() -> None:
             offsets.append(found.offset_px)
     assert np.abs(offsets).max() < 1.0
     assert abs(np.mean(offsets)) < 0.2
+
+
+def along_a_row(rig: StereoRig, depths: tuple[float, float]) -> np.ndarray:
+    """(200, 3) points of a thread along a row of the left image, with these depths at its ends."""
+    across = np.array([0.0, 0.25]) * depths
+    ends = np.stack([across, 0.02 * np.array(depths), depths], axis=1)
+    return np.linspace(ends[0], ends[1], 200)
+
+
+def test_the_views_tell_the_depth_of_ends_that_run_along_an_epipolar_line() -> None:
+    rig = open_scene("figure8-107", 0).rig
+    truth = along_a_row(rig, (200.0, 200.0))
+    guess = curve_through(along_a_row(rig, (197.0, 202.0)))
+    field = paint(rig, [truth], 0, noise=0.0)
+    levels = measure_levels(curve_through(truth), field, rig)
+    for end in (0, 1):
+        told = end_shift(guess, end, field, rig, levels)
+        assert told is not None
+        shift, row = told
+        assert abs(shift) > 1.0
+        missing = truth[-end] - guess.control_points[-end]
+        assert shift == pytest.approx(float(row @ missing), abs=0.4)
+    curve, config = guess, TrackingConfig()
+    for _ in range(30):
+        curve = gauss_newton.fit(curve, curve, field, rig, levels, 5.0, config).curve
+    off = curve.control_points[[0, -1], 2] - truth[[0, -1], 2]
+    assert np.abs(off).max() < 0.6
 
 
 def test_an_end_beside_another_ridge_only_makes_good_what_is_lacking() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
-from suturetrack.tracking.sampling import Samples, values_at, views
+from suturetrack.tracking.sampling import Samples, View, values_at, views
 from suturetrack.types import Float64, Nurbs, RidgeField
 
 _STEP_PX = 0.5
@@ -21,6 +21,8 @@ _BEFORE, _BEHIND, _SYMMETRY = 0.7, 0.15, 1.12
 _SOFTEST_PX = 2.0
 # Responses below this part of a clear view are background.
 _FAINT = 0.2
+# An end that a view shows further away than this from the curve's own is another one, or covered.
+_SHOWN_PX = 3.0
 # What is shorter than this is a speck behind the end and not its continuation.
 _SOLID_PX = 8.0
 
@@ -56,13 +58,7 @@ def find_end(
     None where there is no thread near the end.
     """
     scale = _px_per_s(curve, end, rig)
-    x = np.arange(-min(_INWARD_PX, 0.5 * scale), _OUTWARD_PX + 0.1, _STEP_PX)
-    points, derivatives = _extension(curve, end, np.asarray(x / scale, np.float64))
-    both = views(rig, points, derivatives)
-    responses = [
-        np.minimum(search.responses(image, view.pixels, view.tangents) / level, 1.2)
-        for image, view, level in zip((field.left, field.right), both, levels, strict=True)
-    ]
+    x, both, responses = _profiles(curve, end, field, rig, levels, scale)
     inside = both[0].inside(rig.image_size) & both[1].inside(rig.image_size)
     if not inside.any():
         return None
@@ -76,6 +72,54 @@ def find_end(
         return None
     at_border = not inside.all() and boundary > x[-1] - 3
     return EndStep(boundary, 1 / scale, at_border)
+
+
+def end_shift(
+    curve: Nurbs,
+    end: int,
+    field: RidgeField,
+    rig: StereoRig,
+    levels: tuple[float, float],
+) -> tuple[float, Float64] | None:
+    """By how much further the right view shows the thread at the end `end` (0 or 1) than the left.
+
+    It tells the depth of the end where the thread runs along an epipolar line.
+
+    Returns:
+        The difference in px along the curve, and its (3,) derivative by the place of the end; None
+        where the views do not both show the end.
+    """
+    scale = _px_per_s(curve, end, rig)
+    x, both, responses = _profiles(curve, end, field, rig, levels, scale)
+    tip = int(np.searchsorted(x, 0.0))
+    shown, rows = [], []
+    for view, response in zip(both, responses, strict=True):
+        smooth = _smooth(response)
+        boundary = _outer_boundary(x, smooth, smooth) if view.inside(rig.image_size).all() else None
+        if boundary is None or abs(boundary) > _SHOWN_PX:
+            return None
+        shown.append(boundary)
+        rows.append(view.tangents[tip] @ view.jacobian[tip] / view.speed[tip])
+    outward = scale if end else -scale
+    return shown[1] - shown[0], outward * (rows[1] - rows[0])
+
+
+def _profiles(
+    curve: Nurbs,
+    end: int,
+    field: RidgeField,
+    rig: StereoRig,
+    levels: tuple[float, float],
+    scale: float,
+) -> tuple[Float64, tuple[View, View], list[Float64]]:
+    """(k,) px beyond the end, the curve there in both images, and their (k,) responses."""
+    x = np.arange(-min(_INWARD_PX, 0.5 * scale), _OUTWARD_PX + 0.1, _STEP_PX)
+    both = views(rig, *_extension(curve, end, np.asarray(x / scale, np.float64)))
+    responses = [
+        np.minimum(search.responses(image, view.pixels, view.tangents) / level, 1.2)
+        for image, view, level in zip((field.left, field.right), both, levels, strict=True)
+    ]
+    return x, both, responses
 
 
 def _smooth(profile: Float64) -> Float64:

@@ -18,6 +18,7 @@ from suturetrack.kernels import rows, search, spline
 from suturetrack.nurbs import curve_from
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.crowding import crowded
+from suturetrack.tracking.ends import end_shift
 from suturetrack.tracking.sampling import Samples, View, views
 from suturetrack.tracking.strands import NOBODY, SAME_STRAND_PX, Neighbours, Strand
 from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField
@@ -38,6 +39,8 @@ _EVEN = 150.0
 # A thread that moves so far across itself between two fields is smeared to half its response.
 _SMEARED_PX = 6.5
 _LEAST_FADING = 0.25
+# What the views show differently at an end for other reasons than its depth, such as a hole.
+_TIP_PX = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +114,7 @@ def fit(
     control_points = predicted.control_points
     crowd = _crowd(predicted, samples, field, rig, levels, neighbours)
     surprise: Float64 | None = None
+    tips = [end_shift(predicted, end, field, rig, levels) for end in (0, 1)]
     faded = expected(before, predicted, samples, rig, levels)
     reach, outlier = reach_px, math.inf
     rounds = config.iterations + round(math.log2(max(reach_px / config.search_px, 1.0)))
@@ -118,6 +122,7 @@ def fit(
         linear = _Linearized(samples, control_points, field, rig, faded, reach, neighbours)
         surprise = linear.surprise(crowd) if surprise is None else surprise
         equations = linear.equations(reference, faded, config, outlier, crowd, surprise)
+        equations.add_tips(tips, predicted.control_points - control_points)
         control_points = control_points + equations.solve()
         outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
         reach = max(reach / 2, _REFINED_PX)
@@ -297,6 +302,25 @@ class _Equations:
     def __init__(self, count: int) -> None:
         self.band = np.zeros((3 * count, spline.BANDWIDTH))
         self.gradient = np.zeros(3 * count)
+
+    def add_tips(self, tips: Sequence[tuple[float, Float64] | None], back: Float64) -> None:
+        """Rows for what the views show differently at the ends.
+
+        Args:
+            tips: of `end_shift`, of the predicted curve's start and stop.
+            back: (n + 1, 3) from the control points to the predicted ones.
+        """
+        for end, tip in zip((0, -1), tips, strict=True):
+            if tip is not None:
+                shift, row = tip
+                self._add_tip(end, row / _TIP_PX, (shift + float(row @ back[end])) / _TIP_PX)
+
+    def _add_tip(self, end: int, row: Float64, right: float) -> None:
+        """A row for the first or the last control point, which is the curve's end."""
+        band, gradient = self.band[-3:] if end else self.band[:3], self.gradient.reshape(-1, 3)[end]
+        gradient += right * row
+        for i in range(3):
+            band[i, : i + 1] += row[i] * row[i::-1]
 
     def solve(self) -> Float64:
         """(n + 1, 3) step; leaves the factor in the band."""
