@@ -107,6 +107,34 @@ def in_order(estimate: Float64, truth: Float64, radius: float, samples: int = 30
     return float((min(ways, key=lambda way: float(way.sum())) <= radius).mean())
 
 
+def knot_shift(estimate: Float64, truth: Float64, touching: float, longest: float) -> float:
+    """By how much a curve misplaces a tight knot along the thread; nan where the truth has none.
+
+    A curve passes a tight knot as a point. What counts is how much thread it leaves free before and
+    behind it: the worse of the two differences, run in the direction that fits better.
+
+    Args:
+        estimate: (k, dim) ordered points of the curve, close together.
+        truth: (m, dim) ordered points of the true one, close together.
+        touching: distance, unit of the points, within which the thread touches itself.
+        longest: length of thread within which it does so in a tight knot; what is less than three
+            times `touching` apart along the thread does not count.
+    """
+    travelled = _travelled(truth)
+    apart = travelled - travelled[:, None]
+    one, other = np.nonzero((apart > 3 * touching) & (apart < longest))
+    touch = np.linalg.norm(truth[one] - truth[other], axis=1) < touching
+    if not touch.any():
+        return float("nan")
+    knot = [int(one[touch].min()), int(other[touch].max())]
+    free = np.array([travelled[knot[0]], travelled[-1] - travelled[knot[1]]])
+    places = cKDTree(estimate).query(truth[knot])[1]
+    along = _travelled(estimate)[places]
+    length = polyline_length(estimate)
+    ways = np.abs(along - [0, length]), np.abs(along - [length, 0])
+    return float(min(np.abs(way - free).max() for way in ways))
+
+
 def resample(points: Float64, count: int) -> Float64:
     """(count, dim) points evenly spaced along the polyline through (k, dim) points."""
     travelled = _travelled(points)

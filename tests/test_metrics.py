@@ -69,3 +69,17 @@ def test_walking_in_order_pays_the_least() -> None:
             expected[j - 1] = max(expected[j - 1], distances[i - 1, j - 1])
             i, j = min(((i - 1, j - 1), (i - 1, j), (i, j - 1)), key=lambda at: float(cost[at]))
         np.testing.assert_allclose(met, expected)
+
+
+def test_a_tight_knot_is_misplaced_by_what_the_free_parts_lack() -> None:
+    turn = np.linspace(0, 2 * np.pi, 80)
+    loop = np.stack([30 + 1.5 * np.sin(turn), 1.5 - 1.5 * np.cos(turn), 0.1 * turn], axis=1)
+    before = np.linspace([0.0, 0, 0], [30, 0, 0], 200, endpoint=False)
+    behind = np.linspace(loop[-1], [70.0, 0, 0.2 * np.pi], 300)[1:]
+    truth = np.concatenate([before, loop, behind])
+    passing = np.concatenate([before, behind])
+    assert metrics.knot_shift(passing, truth, 1.0, 15.0) < 0.3
+    assert metrics.knot_shift(passing[::-1], truth, 1.0, 15.0) < 0.3
+    assert metrics.knot_shift(passing[:-30], truth, 1.0, 15.0) == pytest.approx(4.0, abs=0.4)
+    assert np.isnan(metrics.knot_shift(passing, passing, 1.0, 15.0))
+    assert np.isnan(metrics.knot_shift(passing, 5 * truth, 1.0, 15.0))

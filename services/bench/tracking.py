@@ -37,6 +37,8 @@ from suturetrack.types import (
 
 FALSE_BEYOND_MM = 2.0
 """A curve whose 95th percentile is this far from the thread is wrong, whatever it is called."""
+_TOUCHING_MM, _KNOT_MM = 1.0, 15.0
+"""A thread is knotted tightly where it touches itself within so much of its length."""
 _SAMPLES = 400
 _FRAMES_A_LIMIT = 30
 Method = Literal["gauss-newton", "paper"]
@@ -103,6 +105,8 @@ class FrameScore:
     ends: tuple[float, ...] = (math.nan, math.nan)
     coverage: float = 0.0
     """Share of the visible truth within 1 mm of the curve."""
+    knot: float = math.nan
+    """By how much a tight knot is misplaced along the thread; nan where there is none."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +153,7 @@ class Row:
     sigma: float
     ends_p50: float
     ends_p95: float
+    knot_p95: float
     coverage_percent: float
     energy: float
     update_ms: float
@@ -277,6 +282,7 @@ def score(
         depth=_rms(along),
         length=state.length * mm,
         ends=tuple(mm * d for d in metrics.end_distances(curve, truth.points)),
+        knot=metrics.knot_shift(mm * curve, mm * truth.points, _TOUCHING_MM, _KNOT_MM),
         coverage=float(covered.mean()) if len(covered) else math.nan,
     )
 
@@ -316,6 +322,7 @@ def summarise(case: Case, method: Method, thread: str, scores: list[FrameScore])
         sigma=float(error.std()) if len(error) else float("nan"),
         ends_p50=_percentile(ends.ravel(), 50),
         ends_p95=_percentile(ends.ravel(), 95),
+        knot_p95=_known_percentile(_column(scores, "knot")[whole], 95),
         coverage_percent=100 * _mean(_column(scores, "coverage")[tracking]),
         energy=_mean(_column(scores, "energy")[tracking]),
         update_ms=_percentile(_column(scores, "milliseconds"), 50),
@@ -360,6 +367,10 @@ def _rms(values: Float64) -> float:
 
 def _mean(values: Float64) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _known_percentile(values: Float64, q: float) -> float:
+    return _percentile(values[np.isfinite(values)], q)
 
 
 def _percentile(values: Float64, q: float) -> float:
