@@ -257,6 +257,16 @@ def test_an_end_that_leaves_the_image_is_cut_at_the_border(rig: StereoRig) -> No
     assert metrics.coverage(found, visible, 0.5) > 0.98
 
 
+def test_a_thread_that_comes_in_at_the_border_is_as_long_as_it_is_seen(rig: StereoRig) -> None:
+    places = np.r_[np.linspace(0, 60, 30), np.full(40, 60.0), np.linspace(60, 0, 15), np.zeros(20)]
+    truths = [thread(0.3) + np.array([x, 0.0, 0.0]) for x in places]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    assert states[65].length < 85.0
+    assert all(state.status is Status.TRACKING for state in states[65:])
+    assert states[-1].length == pytest.approx(100.0, rel=0.01)
+
+
 def test_what_moves_outside_the_images_is_gone_until_it_comes_in(rig: StereoRig) -> None:
     def swung_out(by: float) -> Nurbs:
         points = np.stack([np.linspace(0, 150, 8), np.zeros(8), np.full(8, 300.0)], axis=1)

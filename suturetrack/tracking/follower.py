@@ -162,7 +162,8 @@ class Follower:
         """
         ends = self.model.ends
         length = length_of(self.model.curve) if plain.mean() > _ALL else ends.wanted
-        self._established |= ends.settled
+        # What the border cuts off comes in again.
+        self._established = (self._established or ends.settled) and not ends.at_border
         return self._established and length > (1 + _GROWTH) * self.known_length + _noise(evidence)
 
     def _makes_detour(self, plain: Bool, evidence: Evidence) -> bool:
