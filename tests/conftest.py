@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import faulthandler
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -21,6 +22,9 @@ settings.register_profile(
     "default", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("default")
+
+# A shell has its jobs in the background ignore interrupts, and so would the programs under test.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _LONGEST_END_S = 60.0
 
