@@ -8,9 +8,9 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from services.drawing.common import VIEWS, part
+from services.topics import PROCESSES
 from suturetrack.types import Float64
 
-PROCESSES = ("source", "segmenter", "tracker")
 _IN_DETAIL = ("tangent", "reliability", "velocity")
 _EYE = np.array([-0.7, -0.55, -0.75])
 """Where the eye of the view of space is from the thread, in sizes of the thread: beside the cameras,

@@ -88,7 +88,7 @@ class Monitor:
                 thread.true_mm.append(self._true_mm[state.thread])
 
     def _in_order(self) -> list[tuple[str, Health]]:
-        order = ("source", "segmenter", "tracker")
+        order = topics.PROCESSES
         names = sorted(self._health, key=lambda n: (order.index(n) if n in order else 9, n))
         return [(name, self._health[name]) for name in names]
 

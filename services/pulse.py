@@ -85,12 +85,19 @@ class Pulse:
         if silent_s > _SILENT_S:
             return _silence(silent_s)
         if not beat.health.ready:
-            return f"it was not ready after {beat.still} s" if beat.still > _BEGINNING else ""
-        stamp = beat.health.stamp
-        period_s = stamp.period_ns / 1e9 if stamp else 0.0
-        if beat.still > max(_STILL, _STILL * period_s):
+            is_late = beat.still > longest_still(beat.health)
+            return f"it was not ready after {beat.still} s" if is_late else ""
+        if beat.still > longest_still(beat.health):
             return f"it finished no frame for {beat.still} s"
         return ""
+
+
+def longest_still(health: Health) -> float:
+    """Heartbeats without a frame from which on a process counts as hung."""
+    if not health.ready:
+        return _BEGINNING
+    period_s = health.stamp.period_ns / 1e9 if health.stamp else 0.0
+    return max(_STILL, _STILL * period_s)
 
 
 def _silence(seconds: float) -> str:

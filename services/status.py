@@ -63,7 +63,7 @@ class RigWatch:
     @property
     def unheard(self) -> list[str]:
         """The processes that every rig needs and of which nothing was heard."""
-        return [name for name in ("source", "segmenter", "tracker") if name not in self.health]
+        return [name for name in topics.PROCESSES if name not in self.health]
 
     def tables(self) -> list[Table]:
         """The processes, and the threads where there are any."""

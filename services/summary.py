@@ -9,11 +9,11 @@ import numpy as np
 
 from services.course import Course, Loss, courses, losses
 from services.run_folder import RunFolder
+from services.topics import PROCESSES
 from suturetrack.types import Float64, Status
 
 WRONG_PX = 3.0
 """A curve whose mean distance from the truth is larger is not on the thread."""
-_ORDER = ("source", "segmenter", "tracker")
 
 
 @dataclass(frozen=True)
@@ -160,5 +160,5 @@ def _processes(folder: RunFolder) -> list[ProcessSummary]:
         dropped, memory_mb = int(largest("dropped", name)), largest("memory_mb", name)
         spread = Spread.of(latency_ms)
         summaries.append(ProcessSummary(name, count, rate_hz, spread, dropped, memory_mb))
-    known = {name: i for i, name in enumerate(_ORDER)}
+    known = {name: i for i, name in enumerate(PROCESSES)}
     return sorted(summaries, key=lambda p: known.get(p.name, len(known)))

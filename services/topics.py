@@ -22,6 +22,9 @@ from services.messages import (
 from suturetrack.camera import StereoRig
 from suturetrack.types import RidgeField, Seed, Stamp, StereoFrame, ThreadState, Truth
 
+PROCESSES = ("source", "segmenter", "tracker")
+"""The processes that every rig needs, in the order of the dataflow."""
+
 T = TypeVar("T")
 Q = TypeVar("Q")
 A = TypeVar("A")

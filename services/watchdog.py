@@ -10,11 +10,7 @@ import socket
 from contextlib import suppress
 
 from services.messages import Health
-
-_STILL = 10
-"""Heartbeats, thus seconds, without a frame until a process hangs, while messages wait for it."""
-_BEGINNING = 180
-"""The same until a process is ready, unless it waits for another: kernels may have to be compiled."""
+from services.pulse import longest_still
 
 
 class Watchdog:
@@ -30,9 +26,7 @@ class Watchdog:
         idle = bool(health.warning) or (health.ready and not work_waits)
         self._still = 0 if idle or progress != self._progress else self._still + 1
         self._progress = progress
-        period_s = health.stamp.period_ns / 1e9 if health.stamp else 0.0
-        longest = max(_STILL, _STILL * period_s) if health.ready else _BEGINNING
-        if self._still <= longest:
+        if self._still <= longest_still(health):
             _tell("READY=1\nWATCHDOG=1")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from services import topics, wire
-from services.bench.system import ROLES, System
+from services.bench.system import System
 from services.bus import Bus, NoAnswer
 from services.messages import Health
 from services.wire import Packet, WireError
@@ -77,7 +77,7 @@ class Attacker:
         return self.health
 
     def heard_of_all(self) -> bool:
-        return set(ROLES) <= self.listen().keys()
+        return set(topics.PROCESSES) <= self.listen().keys()
 
 
 @pytest.mark.parametrize("count", [100, pytest.param(10_000, marks=pytest.mark.long)])
@@ -112,8 +112,8 @@ def test_bad_messages_are_counted_and_harm_nothing(
     seconds = time.monotonic() - began
     system.until_tracking()
     assert {name: process.pid for name, process in system.processes().items()} == pids
-    memory = {p: (before[p].memory_mb, attacker.health[p].memory_mb) for p in ROLES}
-    print(f"{seconds:.0f} s", {p: refused(p) for p in ROLES}, memory)
+    memory = {p: (before[p].memory_mb, attacker.health[p].memory_mb) for p in topics.PROCESSES}
+    print(f"{seconds:.0f} s", {p: refused(p) for p in topics.PROCESSES}, memory)
     for process, (first, last) in memory.items():
         assert last - first < MOST_GROWTH_MB, process
     lines = [line for line in system.said.splitlines() if "refused" in line]

@@ -17,9 +17,10 @@ import psutil
 import pytest
 
 from services.bench.faults import FaultsBench, Measured, inject
-from services.bench.system import ROLES, System, film
+from services.bench.system import System, film
 from services.client import Seen
 from services.run_folder import RunFolder
+from services.topics import PROCESSES
 from suturetrack import nurbs
 from suturetrack.types import InputError, Status
 
@@ -73,7 +74,7 @@ def kill(system: System, process: str) -> float:
 @pytest.mark.parametrize("kind", FaultsBench.kinds)
 def test_a_consumer_is_not_told_live_three_periods_after_a_fault(system: System, kind: str) -> None:
     chance = random.Random(kind)
-    for process in ROLES:
+    for process in PROCESSES:
         measured = Measured()
         inject(system, kind, process, measured, FPS, chance)  # type: ignore[arg-type]
         assert measured.missed == 0, (process, measured)
@@ -178,7 +179,7 @@ def test_what_is_at_fault_in_the_input_is_not_tried_again(start: Callable[..., S
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("process", ROLES)
+@pytest.mark.parametrize("process", PROCESSES)
 def test_a_hundred_deaths(start: Callable[..., System], process: str) -> None:
     die_at_random(start("--restarts", "1000"), 100, (process,))
 
@@ -192,7 +193,7 @@ def recordings(system: System) -> int:
 
 
 def die_at_random(
-    system: System, times: int, processes: tuple[str, ...] = ROLES, most_s: float = 2.0
+    system: System, times: int, processes: tuple[str, ...] = PROCESSES, most_s: float = 2.0
 ) -> None:
     """Kills processes at random moments, and looks at what is left of the run."""
     chance = random.Random(times)

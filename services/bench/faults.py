@@ -20,7 +20,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from services.bench import report
-from services.bench.system import ROLES, System, film, private_folder, rig_name
+from services.bench.system import System, film, private_folder, rig_name
+from services.topics import PROCESSES
 from suturetrack.types import InputError
 
 Kind = Literal["killed", "stopped", "hung", "silent"]
@@ -43,7 +44,7 @@ class FaultsBench:
     kinds: tuple[Kind, ...] = ("killed", "stopped", "hung", "silent")
     """killed: SIGKILL; stopped: SIGSTOP; hung: the thread of the loop stands still, heartbeats go on;
     silent: the loop goes on, but nothing leaves the process."""
-    processes: tuple[str, ...] = ROLES
+    processes: tuple[str, ...] = PROCESSES
     """Into which processes."""
     fps: float = 30.0
     """Frames a second."""

@@ -20,7 +20,7 @@ from rich.progress import Progress
 
 from services import topics
 from services.bench import report
-from services.bench.system import ROLES, System, film, private_folder, rig_name
+from services.bench.system import System, film, private_folder, rig_name
 from services.client import Seen
 from services.messages import Health
 
@@ -147,7 +147,7 @@ class _Watch:
         processes = self._system.processes().items()
         with suppress(psutil.NoSuchProcess):
             used = {name: process.memory_info().rss / 1e6 for name, process in processes}
-            if len(used) == len(ROLES):
+            if len(used) == len(topics.PROCESSES):
                 self.memory.append((time.monotonic(), used))
         while (health := self._healths.get(0)) is not None:
             self.healths[health.process] = health
@@ -195,9 +195,9 @@ def _row(load: str, fps: float, watch: _Watch, from_ns: int, missed: int) -> Row
     frames, arrived, latency = np.array([s for s in watch.seen if s[1] >= from_ns]).T
     duration_s = (arrived[-1] - arrived[0]) / 1e9
     asked = int(frames[-1] - frames[0])
-    healths = [watch.healths[name] for name in ROLES]
+    healths = [watch.healths[name] for name in topics.PROCESSES]
     memory_mb = sum(watch.memory[-1][1].values())
-    growth_mb = {name: _growth_mb(watch.memory, name) for name in ROLES}
+    growth_mb = {name: _growth_mb(watch.memory, name) for name in topics.PROCESSES}
     return Row(
         load=load,
         asked_hz=fps,

@@ -31,7 +31,6 @@ _RIG = "bench-recording"
 _LEVELS: tuple[Level, ...] = ("light", "full")
 _Key = tuple[Level | None, str]
 """Level and process."""
-_PROCESSES = ("source", "segmenter", "tracker")
 _RATE_HZ = 30.0
 _LONGEST_S = 300.0
 
@@ -136,7 +135,7 @@ def _loops(scene: Scene, frames: int) -> dict[str, list[Callable[[Recorder], Non
     segmenter, tracker = Segmenter(scene.rig), Tracker(scene.rig)
     seed = Seed(pixel=scene.seed_pixel(0))
     tracker.seed(seed)
-    loops: dict[str, list[Callable[[Recorder], None]]] = {name: [] for name in _PROCESSES}
+    loops: dict[str, list[Callable[[Recorder], None]]] = {name: [] for name in topics.PROCESSES}
     for i in range(min(frames, 30)):
         frame = StereoFrame(Stamp(i, round(i * 1e9 / _RATE_HZ), time.time_ns()), *scene.render(i))
         if i == 0:
@@ -189,6 +188,6 @@ def _rates(config: RecordingBench, level: Level | None, *, lockstep: bool) -> di
             last[health.process] = health
     done = [h.frames for h in last.values()]
     least = config.frames if lockstep else 2
-    if set(last) != set(_PROCESSES) or min(done) < least:
+    if set(last) != set(topics.PROCESSES) or min(done) < least:
         raise InputError(f"bench recording: a run did {done} of {config.frames} frames")
     return {name: health.run_rate_hz for name, health in last.items()}

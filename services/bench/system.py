@@ -18,11 +18,11 @@ import cv2
 import psutil
 
 from services.client import Seen, connect
+from services.topics import PROCESSES
 from suturetrack.calibration import save_calibration
 from suturetrack.stage import open_scene
 from suturetrack.types import InputError, Status
 
-ROLES = ("source", "segmenter", "tracker")
 START_S = 180.0
 """A first start compiles the kernels."""
 _POLL_S = 0.0005
@@ -121,7 +121,7 @@ def named(parent: psutil.Process) -> dict[str, psutil.Process]:
     found = {}
     for child in parent.children():
         with suppress(psutil.NoSuchProcess):
-            if child.name() in ROLES and child.status() != psutil.STATUS_ZOMBIE:
+            if child.name() in PROCESSES and child.status() != psutil.STATUS_ZOMBIE:
                 found[child.name()] = child
     return found
 
