@@ -5,7 +5,6 @@ import pytest
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.metrics import polyline_length
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import TrackingConfig, gauss_newton
@@ -21,7 +20,7 @@ PIXEL = 0.0025
 def curve_through(points: np.ndarray) -> Nurbs:
     travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
     knots = nurbs.clamped_knots(np.linspace(0, 1, 25)[1:-1], 3)
-    return nurbs.fit(points, travelled / polyline_length(points), knots, 3)
+    return nurbs.fit(points, travelled / travelled[-1], knots, 3)
 
 
 def step_at(offset_px: float) -> EndStep:
