@@ -77,7 +77,8 @@ class Strangers:
         branches: list[Bool] = []
         ridges = []
         for side, (image, view) in enumerate(zip((field.left, field.right), both, strict=True)):
-            power = np.einsum("ijk,ijk->ij", image, image) / np.float32(levels[side] ** 2)
+            u, v = image[..., 0], image[..., 1]
+            power = np.asarray((u * u + v * v) / levels[side] ** 2, np.float32)
             ridges.append(_packed(power))
             if past and (side == 0 or branches[0].any()):
                 always = np.bitwise_and.reduce([then[1][side] for then in past])
