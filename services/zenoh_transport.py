@@ -105,6 +105,8 @@ def local_config(rig: str, process: str) -> zenoh.Config:
             "period_max_ms": 200,
             "period_increase_factor": 2,
         },
+        # Longer than any greeting takes; closing waits for one to a process that stands still.
+        "transport/unicast/open_timeout": 2000,
         "transport/link/rx/max_message_size": _LARGEST_MESSAGE,
         # Room for hundreds of states, so that none is dropped while a machine is short of time.
         "transport/link/tx/queue/size/interactive_high": 16,

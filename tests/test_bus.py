@@ -286,6 +286,36 @@ def test_a_killed_process_is_seen_to_die_and_may_come_back(rig_name: str) -> Non
         remove_sockets(rig_name)
 
 
+def test_who_leaves_waits_little_for_a_process_that_stands_still(rig_name: str) -> None:
+    other = start_other()
+    watch = Bus(ZenohTransport(local_config(rig_name, "status")), rig_name, "status")
+    try:
+        assert watch.wait_for_alive("tracker", 20)
+        other.send_signal(signal.SIGSTOP)
+        patient = local_config(rig_name, "patient")
+        patient.insert_json5("transport/unicast/open_timeout", "5000")
+        left = []
+
+        def leave(name: str, transport: ZenohTransport) -> None:
+            transport.close()
+            left.append(name)
+
+        configs = {"patient": patient, "usual": local_config(rig_name, "usual")}
+        transports = {name: ZenohTransport(config) for name, config in configs.items()}
+        leaving = [threading.Thread(target=leave, args=each) for each in transports.items()]
+        for thread in leaving:
+            thread.start()
+        wait_until(lambda: left)
+        assert left == ["usual"]
+    finally:
+        other.kill()
+        other.wait()
+        watch.close()
+    for thread in leaving:
+        thread.join()
+    remove_sockets(rig_name)
+
+
 def test_a_second_process_of_one_name_is_told_so(rig_name: str) -> None:
     first = ZenohTransport(local_config(rig_name, "source"))
     try:
