@@ -20,6 +20,8 @@ from cryptography import x509
 from rich.console import Console
 from rich.text import Text
 
+from services.messages import Health
+from services.service import WAITS_FOR
 from services.status import RigWatch, watch_rigs
 from services.tables import new_table
 from services.zenoh_transport import socket_directory
@@ -206,6 +208,8 @@ def _rates(watch: RigWatch) -> Iterator[Finding]:
         return
     wanted = watch.health["source"][0].rate_hz
     for name, (health, _) in sorted(watch.health.items()):
+        if _awaited(health):
+            continue
         if name in ("segmenter", "tracker") and health.rate_hz < _SLOW * wanted:
             text = f"{health.rate_hz:.1f} Hz of {wanted:.1f} Hz"
             advice = "too slow for this rate: lower it, or give the process a core of its own"
@@ -221,7 +225,14 @@ def _rates(watch: RigWatch) -> Iterator[Finding]:
 def _troubles(watch: RigWatch) -> Iterator[Finding]:
     for name, (health, _) in sorted(watch.health.items()):
         subject = f"{watch.rig}: {name}"
-        if health.warning:
+        awaited = _awaited(health)
+        if awaited in watch.unheard:
+            advice = f"start the {awaited}, as above; this process then goes on by itself"
+            yield Finding(WARNING, subject, health.warning, advice)
+        elif awaited:
+            advice = f"it goes on by itself; if it does not, see the log of the {awaited}"
+            yield Finding(WARNING, subject, health.warning, advice)
+        elif health.warning:
             yield Finding(ERROR, subject, health.warning, "see its log")
         if health.refused:
             text = f"{health.refused} bad messages refused"
@@ -231,6 +242,12 @@ def _troubles(watch: RigWatch) -> Iterator[Finding]:
             yield Finding(WARNING, subject, text, "the machine is short of time")
         if health.restarts:
             yield Finding(WARNING, subject, f"started again {health.restarts}x", "see its log")
+
+
+def _awaited(health: Health) -> str:
+    """The process without which this one cannot go on; empty when it can."""
+    _, _, process = health.warning.partition(WAITS_FOR)
+    return process
 
 
 def _clocks(watch: RigWatch) -> Iterator[Finding]:

@@ -62,7 +62,7 @@ def run(service: Service, config: SegmenterConfig) -> None:
     if held is not None:
         given = [seed for seed in given if seed.thread not in held.threads]
     bus.keep(topics.STEP)
-    with service.waiting("the tracker"):
+    with service.waiting("tracker"):
         if not bus.wait_for_alive("tracker"):
             raise Stopped
     frames = bus.newest(topics.FRAME)

@@ -39,6 +39,9 @@ _GRACE_S = 1.2
 """From the wish to stop until a step that takes too long is interrupted."""
 _COMPLAINT_INTERVAL_S = 1.0
 
+WAITS_FOR = "waits for the "
+"""Begins the warning of a process that cannot go on without another, which it names."""
+
 log = logging.getLogger("suturetrack")
 
 
@@ -95,16 +98,16 @@ class Service:
 
     def calibrated_rig(self) -> StereoRig:
         """The rig as the source tells it, as soon as there is a source; raises Stopped."""
-        with self.waiting("the source"):
+        with self.waiting("source"):
             rig = self.bus.ask_until_answered(topics.CALIBRATION, None)
         if rig is None:
             raise Stopped
         return rig
 
     @contextmanager
-    def waiting(self, what: str) -> Iterator[None]:
-        """Says in the health what the process waits for, so that nobody takes it for hung."""
-        self.warning = f"waits for {what}"
+    def waiting(self, process: str) -> Iterator[None]:
+        """Says in the health which process this one waits for, so that nobody takes it for hung."""
+        self.warning = WAITS_FOR + process
         yield
         self.warning = ""
 

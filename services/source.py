@@ -58,8 +58,10 @@ def run(service: Service, config: SourceConfig) -> None:
     bus.keep(topics.STATE, _is_worth_keeping)
     bus.keep(topics.SEEDING)
     service.ready()
-    if not footage.live and not bus.wait_for_alive("segmenter"):
-        return
+    if not footage.live:
+        with service.waiting("segmenter"):
+            if not bus.wait_for_alive("segmenter"):
+                return
     watch = _Watch(service)
     period_ns = 0 if config.service.lockstep else round(1e9 / footage.fps)
     pace = _Pace(service, footage, config.input.frames, _left_off(service))

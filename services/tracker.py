@@ -57,7 +57,7 @@ def run(service: Service, config: TrackerConfig) -> None:
             desk.seed(seed)
     recorder = service.record(rig, config)
     if config.service.lockstep:
-        with service.waiting("the source"):
+        with service.waiting("source"):
             if not bus.wait_for_readers(topics.STEP):
                 raise Stopped
     fields = bus.newest(topics.FIELD)

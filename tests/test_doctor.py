@@ -19,6 +19,7 @@ from services.bus import Bus
 from services.doctor import ERROR, OK, WARNING, DoctorConfig, certificates, examine, listening
 from services.keys import KeysConfig, init
 from services.messages import Health, Latency
+from services.service import WAITS_FOR
 from services.status import StatusConfig, run, watch_rigs
 from services.zenoh_transport import ZenohTransport, local_config, local_rigs
 from suturetrack.types import Energies, InputError, Stamp, Status, ThreadState
@@ -90,6 +91,22 @@ def test_troubles_of_a_running_system_are_named(rig: Bus) -> None:
     assert any(
         t.startswith("its clock is 3.0") and t.endswith("ahead of this one") for _, t in rest
     )
+
+
+def test_a_process_that_waits_is_no_trouble_of_its_own(rig: Bus) -> None:
+    waits = replace(HEALTHY, frames=0, rate_hz=0.0)
+    alone = replace(waits, process="tracker", warning=f"{WAITS_FOR}source")
+    say(rig, alone)
+    advice = {f.subject: f for f in examine(DoctorConfig(rig.rig))}
+    found = advice[f"{rig.rig}: tracker"]
+    assert (found.level, found.text) == (WARNING, "waits for the source")
+    assert found.advice == "start the source, as above; this process then goes on by itself"
+    unready = replace(waits, process="segmenter", warning=f"{WAITS_FOR}tracker")
+    say(rig, waits, unready, replace(waits, process="tracker"))
+    advice = {f.subject: f for f in examine(DoctorConfig(rig.rig))}
+    found = advice[f"{rig.rig}: segmenter"]
+    assert (found.level, found.text) == (WARNING, "waits for the tracker")
+    assert found.advice == "it goes on by itself; if it does not, see the log of the tracker"
 
 
 def test_certificates_near_their_end_are_named(tmp_path: Path) -> None:
