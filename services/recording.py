@@ -213,7 +213,7 @@ class Recorder:
     def _work(self, file: RunFile) -> None:
         """The recording thread: one value after the other, and a look at the file in quiet times."""
         if sys.platform == "linux":  # elsewhere a thread has no priority of its own
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+            os.nice(_NICE)
         while True:
             try:
                 task = self._tasks.get(timeout=self._pause)

@@ -442,6 +442,26 @@ def writer(run: Path, limit: int = 0) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+LOW = """
+    import os, sys, threading
+    from pathlib import Path
+    from services.recording import Recorder
+    from tests.conftest import make_rig
+    low = os.nice(10)
+    with Recorder(Path(sys.argv[1]), "source", "light", make_rig()) as recorder:
+        [thread] = [t for t in threading.enumerate() if t.name == "recording"]
+        while (nice := os.getpriority(os.PRIO_PROCESS, thread.native_id)) == low:
+            pass
+        print(nice - low)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have no priorities of their own")
+def test_recording_gives_way_to_a_process_of_low_priority_too(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", textwrap.dedent(LOW), str(tmp_path / "run")]
+    assert subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout == "5\n"
+
+
 @pytest.mark.parametrize(
     "seconds", [3.7, *(pytest.param(0.3 + 0.21 * k, marks=pytest.mark.long) for k in range(20))]
 )
