@@ -116,6 +116,29 @@ def test_a_curve_that_the_thread_has_left_is_not_called_tracking(
     assert Status.TRACKING not in statuses[-4:]
 
 
+def test_what_branched_off_a_curve_says_nothing_of_the_one_that_takes_its_place(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = fields(rig, (0.0, 0.0), (1.0, 4.5))
+    u, v = rig.project_raw(line()[200])[0]
+    seed = Seed("0", pixel=(float(u), float(v)))
+    first = replace(initialize(paint(rig, [line()], 0), rig, seed), confidence=0.9)
+    looks: list[RidgeField] = []
+
+    def look(field: RidgeField, *_: object) -> Initialization:
+        looks.append(field)
+        bulge = 1.0 + 3.5 * field.stamp.frame / round(SECONDS * FPS)
+        return first if len(looks) == 1 else replace(first, curve=curve_through(line(bulge)))
+
+    monkeypatch.setattr("suturetrack.tracking.recovery.initialize", look)
+    tracker = Tracker(rig)
+    tracker.seed(seed)
+    states = [tracker.step(field).states[0] for field in shown]
+    (place,) = [i for i, state in enumerate(states) if "found for sure" in state.events]
+    assert states[place - 1].status is Status.OCCLUDED
+    assert states[place].status is Status.TRACKING
+
+
 def test_what_moves_across_the_curve_is_no_stranger(rig: StereoRig) -> None:
     across = [np.c_[20 * T, 6 * T + i / 2, np.full(400, 200.0)] for i in range(20)]
     shown = [paint(rig, [line(), other], 3 * i) for i, other in enumerate(across)]

@@ -51,6 +51,10 @@ class Strangers:
     _past: tuple[tuple[int, tuple[UInt8, UInt8]], ...] = ()
     """Capture times and where there were ridges, left and right, a bit for each pixel."""
 
+    def of_another(self) -> Strangers:
+        """The same past, of which nothing has been said about another curve yet."""
+        return replace(self, is_found=False, _suspected=False)
+
     def step(
         self,
         curve: Nurbs,

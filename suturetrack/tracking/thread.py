@@ -101,7 +101,7 @@ class Thread:
         if state.status is not Status.LOST and all_held:
             self._look_for_strangers(state, field, others)
         else:
-            self._strangers = replace(self._strangers, is_found=False)
+            self._strangers = self._strangers.of_another()
         self._come_to(state)
         if self.is_held and not self._is_uncertain:
             self._rest = self._failures = 0
@@ -235,6 +235,7 @@ class Thread:
         assert outcome.pursuit is not None
         assert outcome.state is not None
         self._pursuit, state = outcome.pursuit, outcome.state
+        self._strangers = self._strangers.of_another()
         self._sureness = sureness or Sureness(
             outcome.pursuit.confidence,
             outcome.pursuit.follower.model.curve,
