@@ -220,6 +220,21 @@ def test_what_a_tool_has_swept_over_is_taken_up_as_a_whole(rig: StereoRig) -> No
     assert error(states[-1], truths[-1]).rms < 0.15
 
 
+def test_an_end_that_was_given_up_may_come_back(rig: StereoRig) -> None:
+    """What is left was taken for the whole thread by then, and is longer again."""
+    hidden = range(30, 100)
+    truths = [thread(3 * np.clip(i - hidden.start, 0, 20) / FPS) for i in range(125)]
+    fields = [
+        paint(rig, [points[:552] if i in hidden else points], i) for i, points in enumerate(truths)
+    ]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    given_up = states[hidden.stop - 1]
+    assert given_up.status is Status.TRACKING
+    assert given_up.length == pytest.approx(92.0, rel=0.01)
+    assert all(state.status is Status.TRACKING for state in states[hidden.stop :])
+    assert states[-1].length > 97.0
+
+
 def test_a_thread_that_is_drawn_out_grows(rig: StereoRig) -> None:
     whole = thread(0.0)
     lengths = np.linspace(350, 560, 40).astype(int)

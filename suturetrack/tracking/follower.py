@@ -86,6 +86,7 @@ class Follower:
         """The curve when it was last tracked."""
         self.known_length = length_of(curve)
         """Length of the thread when it was last tracked and all of it seen, calibration's unit."""
+        self._length_before_cut = 0.0
         self._lost = self._cut = self._established = False
         self._certain_ns = now
         self._doubted_ns = -(1 << 62)
@@ -98,6 +99,7 @@ class Follower:
     def remember(self, before: Follower) -> None:
         """Takes over what was known of the thread's length before it was found anew."""
         self.known_length, self._established = before.known_length, before._established
+        self._length_before_cut = before._length_before_cut
 
     def came_from(self, before: Nurbs, seconds: float) -> None:
         """Tells where the thread was found so many seconds ago."""
@@ -105,6 +107,11 @@ class Follower:
         model.motion = Motion.none().learn(
             before, model.curve, self._seen, model.ends.seen, self.rig, seconds
         )
+
+    @property
+    def known_lengths(self) -> tuple[float, ...]:
+        """Lengths that the thread may have: an end that stays away may have been hidden."""
+        return self.known_length, max(self.known_length, self._length_before_cut)
 
     @property
     def is_doubtful(self) -> bool:
@@ -164,7 +171,8 @@ class Follower:
         length = length_of(self.model.curve) if plain.mean() > _ALL else ends.wanted
         # What the border cuts off comes in again.
         self._established = (self._established or ends.settled) and not ends.at_border
-        return self._established and length > (1 + _GROWTH) * self.known_length + _noise(evidence)
+        longest = (1 + _GROWTH) * max(self.known_lengths) + _noise(evidence)
+        return self._established and length > longest
 
     def _makes_detour(self, plain: Bool, evidence: Evidence) -> bool:
         """Whether the curve is longer than the thread and not alone all along.
@@ -180,7 +188,7 @@ class Follower:
         is_clear = (plain & evidence.alone).mean() > _ALL
         tolerance = _LENGTH_TOLERANCE if is_clear else _CROWDED_TOLERANCE
         length, noise = length_of(self.model.curve), _noise(evidence)
-        lengths = self.known_length, length_of(self.last_good)
+        lengths = *self.known_lengths, length_of(self.last_good)
         return all(abs(length - known) > tolerance * known + noise for known in lengths)
 
     def _judge(
@@ -190,6 +198,7 @@ class Follower:
         model = self.model
         if plain.mean() >= 1 - ASTRAY and model.ends.settled and self._cut:
             self._cut = False
+            self._length_before_cut = max(self.known_lengths)
             self.known_length = min(self.known_length, model.ends.length)
         doubted = wrong | self._doubt.anywhere
         certain = doubted.mean() <= ASTRAY and not overlong and not self._short

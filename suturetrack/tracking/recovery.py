@@ -49,7 +49,7 @@ class Setup:
 
 def find_again(
     last: Nurbs,
-    known_length: float | None,
+    known_lengths: tuple[float, ...],
     starts: Iterable[Seed],
     field: RidgeField,
     setup: Setup,
@@ -58,7 +58,7 @@ def find_again(
 ) -> Initialization | None:
     """The thread in the field, run in the direction of the last curve; None where it is not found.
 
-    A curve counts as the thread if its length is the known one, or none is known. A brief search
+    A curve counts as the thread if its length is a known one, or none is known. A brief search
     gives up with the first that does not.
     """
     for start in starts:
@@ -66,7 +66,7 @@ def find_again(
             found = setup.look(field, start)
         except InitializationError:
             continue
-        if has_length(found.curve, known_length):
+        if has_length(found.curve, known_lengths):
             return replace(found, curve=directed(found.curve, last))
         if is_brief:
             break
@@ -95,9 +95,11 @@ def starts_on(last: Nurbs, seed: Seed, field: RidgeField, rig: StereoRig) -> lis
     return [*(Seed(seed.thread, point=(float(x), float(y), float(z))) for x, y, z in clear), seed]
 
 
-def has_length(curve: Nurbs, known_length: float | None) -> bool:
+def has_length(curve: Nurbs, known_lengths: tuple[float, ...]) -> bool:
     """Whether the curve is as long as the thread is known to be; any is where nothing is known."""
-    return known_length is None or abs(length(curve) / known_length - 1) < _LENGTH_TOLERANCE
+    actual = length(curve)
+    near = [abs(actual / known - 1) < _LENGTH_TOLERANCE for known in known_lengths]
+    return any(near) or not near
 
 
 def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:

@@ -55,8 +55,8 @@ class Again:
     setup: Setup
     last: Nurbs
     """Where it was held last."""
-    known_length: float | None
-    """What its length has to be, if anything."""
+    known_lengths: tuple[float, ...]
+    """What its length has to be one of, if anything."""
     rig: StereoRig
     """With the rows on which the last curve was held."""
     before: Follower | None
@@ -70,7 +70,7 @@ class Again:
         is_brief, first = self.turn is not None, (self.turn or 0) % len(starts)
         starts = starts[first:] + starts[:first]
         found = find_again(
-            self.last, self.known_length, starts, field, self.setup, is_brief=is_brief
+            self.last, self.known_lengths, starts, field, self.setup, is_brief=is_brief
         )
         return None if found is None or lies_on(found.curve, others, self.rig) else found
 
@@ -97,9 +97,9 @@ class Closer:
             found = self.setup.look(field, self.seed)
         except (InitializationError, InputError):  # The place may have left the image.
             return None
-        known_length = None if self.before is None else self.before.known_length
+        known_lengths = () if self.before is None else self.before.known_lengths
         rig = self.setup.rig.with_row_offset(found.row_offset_px)
-        if lies_on(found.curve, others, rig) or not has_length(found.curve, known_length):
+        if lies_on(found.curve, others, rig) or not has_length(found.curve, known_lengths):
             return None
         return replace(found, curve=directed(found.curve, self.followed))
 

@@ -159,13 +159,11 @@ class Thread:
         turn = self._failures - 1 if is_beside else None
         follower = copy.copy(self.follower)
         if follower is not None:
-            last, known_length, rig = follower.last_good, follower.known_length, follower.rig
-            return Again(self._seed, self._setup, last, known_length, rig, follower, turn)
+            last, lengths, rig = follower.last_good, follower.known_lengths, follower.rig
+            return Again(self._seed, self._setup, last, lengths, rig, follower, turn)
         assert self._state.curve is not None
-        length = self._state.length if self._failures <= _QUICK_ATTEMPTS else None
-        return Again(
-            self._seed, self._setup, self._state.curve, length, self._setup.rig, None, turn
-        )
+        known = (self._state.length,) if self._failures <= _QUICK_ATTEMPTS else ()
+        return Again(self._seed, self._setup, self._state.curve, known, self._setup.rig, None, turn)
 
     def _search_closer(self, now_ns: int) -> Search | None:
         assert self.follower is not None
@@ -189,7 +187,7 @@ class Thread:
         elif outcome.pursuit is None or outcome.pursuit.lies_on(others):
             return
         elif isinstance(search, Again):
-            self._take_again(outcome, search.known_length)
+            self._take_again(outcome, search.known_lengths)
         else:
             self._take_closer(search, outcome)
 
@@ -203,7 +201,7 @@ class Thread:
         self._seeded_at = _nearest(outcome.found.curve, self._seed, self._setup.rig)
         self._hold(outcome, "found")
 
-    def _take_again(self, outcome: Outcome, known_length: float | None) -> None:
+    def _take_again(self, outcome: Outcome, known_lengths: tuple[float, ...]) -> None:
         """A thread that is held still gives way only to a curve that is sure."""
         assert outcome.pursuit is not None
         assert outcome.state is not None
@@ -212,7 +210,7 @@ class Thread:
         is_sure = outcome.pursuit.confidence >= SURE
         is_worse = self._state.status is not Status.TRACKING and (is_sure or not self.is_held)
         # What is followed may have shrunk from what was found.
-        is_whole = has_length(outcome.state.curve, known_length)
+        is_whole = has_length(outcome.state.curve, known_lengths)
         if is_worse and is_whole and outcome.state.status is Status.TRACKING:
             self._hold(outcome, "found again")
 
