@@ -15,6 +15,8 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, initialize
 from suturetrack.initialization.matching import raised
 from suturetrack.tracking import Tracker
+from suturetrack.tracking.follower import Follower
+from suturetrack.tracking.sureness import Sureness
 from suturetrack.types import RidgeField, Seed, Status, ThreadState
 from tests.painting import FPS, paint, thread
 
@@ -281,3 +283,49 @@ def test_a_plain_look_takes_the_place_of_a_hopeless_one_at_once(
     assert all(state.status is Status.OCCLUDED for state in states[:sure])
     assert all(state.status is Status.TRACKING for state in states[sure:])
     assert max(rms(state, pair(i)[1]) for i, state in enumerate(states) if i >= sure) < 0.25
+
+
+def test_a_curve_that_lacks_an_end_is_what_a_look_finds(rig: StereoRig) -> None:
+    field = paint(rig, [thread(0.0)], 0)
+    whole = initialize(field, rig, seed_on(rig, thread(0.0))).curve
+    short, shorter = nurbs.part(whole, 0.0, 0.93), nurbs.part(whole, 0.0, 0.8)
+    for followed, found, is_sure in (
+        (short, whole, True),
+        (whole, short, False),
+        (shorter, whole, False),
+    ):
+        sureness = Sureness(0.3, followed, 0, rig)
+        takes_place = sureness.weigh(0.6, found, followed)
+        assert (sureness.is_sure, takes_place) == (is_sure, True)
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_what_was_followed_for_sure_is_known_again(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, other: bool
+) -> None:
+    """However doubtful it looks by itself, but nothing else is."""
+    lost_at, step = 6, Follower.step
+    truth, elsewhere = thread(0.0), thread(0.0) + np.array([0.0, 6.0, 0.0])
+    first: list[Follower] = []
+    confidences = iter([0.9])
+
+    def lose(self: Follower, field: RidgeField, *args: object) -> ThreadState:
+        state = step(self, field, *args)  # type: ignore[arg-type]
+        first[:] = first or [self]
+        is_lost = self is first[0] and field.stamp.frame >= lost_at
+        return replace(state, status=Status.LOST) if is_lost else state
+
+    def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
+        confidence = next(confidences, 0.3)
+        points = elsewhere if other and confidence < 0.5 else truth
+        return replace(initialize(field, rig, seed_on(rig, points)), confidence=confidence)
+
+    monkeypatch.setattr(Follower, "step", lose)
+    looks_by(monkeypatch, look)
+    fields = [paint(rig, [truth, elsewhere], i) for i in range(12)]
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, truth))
+    states = [tracker.step(field).states[0] for field in fields]
+    assert states[lost_at - 1].status is Status.TRACKING
+    assert any("found again" in state.events for state in states)
+    assert states[-1].status is (Status.OCCLUDED if other else Status.TRACKING)

@@ -20,6 +20,8 @@ _SAME_PX, _OTHER_PX = 5.0, 15.0
 # How much the thread has to bend between two looks that both count.
 _BENT_PX = 2.0
 _PLACES = 64
+# What a curve may lack at an end, as a part of the thread.
+_LACKING = 0.15
 # The pause after the first look. It doubles after every few looks, so often at most where the thread
 # moves and at rest.
 _PAUSE_NS = 250_000_000
@@ -31,9 +33,10 @@ class Sureness:
     """What the looks at a thread say together.
 
     A look votes for the curve that is followed if it finds the same one, from end to end in the same
-    order, and against it if it finds another; the square of its confidence is its weight. What is
-    voted down gives way to what the last look found. A look at the same picture says nothing new: it
-    counts only if the thread has bent since the last one that did, or if it is sure by itself.
+    order but for what the curve may lack at an end, and against it if it finds another; the square of
+    its confidence is its weight. What is voted down gives way to what the last look found. A look at
+    the same picture says nothing new: it counts only if the thread has bent since the last one that
+    did, or if it is sure by itself.
 
     Args:
         confidence: of the look that found the curve.
@@ -69,17 +72,24 @@ class Sureness:
         """Adds a look; whether what it found, in the direction of what is followed, takes its place."""
         places = self._outline(found), self._outline(followed)
         apart = float(np.linalg.norm(places[0] - places[1], axis=2).max())
-        if confidence >= SURE and apart < _OTHER_PX:
+        agrees = apart < _SAME_PX or self.is_same(found, followed)
+        if confidence >= SURE and (agrees or apart < _OTHER_PX):
             self.is_sure = True
             return apart >= _SAME_PX
-        if (confidence < SURE and not self._has_bent(followed)) or _SAME_PX <= apart < _OTHER_PX:
+        if confidence < SURE and not self._has_bent(followed):
             return False
-        agrees = apart < _SAME_PX
+        if not agrees and apart < _OTHER_PX:
+            return False
         self._votes += _votes(confidence) if agrees else -_votes(confidence)
         is_outvoted = self._votes < 0
         self.is_sure = self._votes >= _ENOUGH if agrees else -self._votes >= _PLENTY
         self._votes, self._shape = abs(self._votes), places[0 if is_outvoted else 1]
         return is_outvoted
+
+    def is_same(self, found: Nurbs, followed: Nurbs) -> bool:
+        """Whether what was found is what is followed, which may lack a little at its ends."""
+        both = zip(self._lines(found), self._lines(followed), strict=True)
+        return max(_apart(whole, part) for whole, part in both) < _SAME_PX
 
     def _has_bent(self, curve: Nurbs) -> bool:
         """Whether its left image is no more the one that counted last, moved, turned and enlarged."""
@@ -93,8 +103,23 @@ class Sureness:
 
     def _outline(self, curve: Nurbs) -> Float64:
         """(2, k, 2) px, evenly spaced along the left and along the right image of the curve."""
+        return np.stack([resample(view, _PLACES) for view in self._lines(curve)])
+
+    def _lines(self, curve: Nurbs) -> tuple[Float64, Float64]:
+        """Its left and its right image, each (n, 2) px."""
         s: Float64 = np.linspace(0, 1, 8 * _PLACES)
-        return np.stack([resample(view, _PLACES) for view in self._rig.project(evaluate(curve, s))])
+        return self._rig.project(evaluate(curve, s))
+
+
+def _apart(whole: Float64, part: Float64) -> float:
+    """How far two lines, each (n, 2), are apart from end to end without what the second one lacks."""
+    reach = round(_LACKING * len(whole))
+    start, stop = (
+        int(np.argmin(np.linalg.norm(tip - end, axis=1)))
+        for tip, end in ((whole[:reach], part[0]), (whole[: -reach - 1 : -1], part[-1]))
+    )
+    there = resample(whole[start : len(whole) - stop], _PLACES)
+    return float(np.linalg.norm(there - resample(part, _PLACES), axis=1).max())
 
 
 def _votes(confidence: float) -> float:

@@ -212,7 +212,15 @@ class Thread:
         # What is followed may have shrunk from what was found.
         is_whole = has_length(outcome.state.curve, known_lengths)
         if is_worse and is_whole and outcome.state.status is Status.TRACKING:
-            self._hold(outcome, "found again")
+            is_known = self._was_followed_for_sure(outcome.state.curve)
+            self._hold(outcome, "found again", self._sureness if is_known else None)
+
+    def _was_followed_for_sure(self, found: Nurbs) -> bool:
+        """Whether it is what was followed for sure before it was lost, and beside the search."""
+        if self.follower is None or self._sureness is None or not self._sureness.is_sure:
+            return False
+        before = self.follower.model.curve, self.follower.last_good
+        return any(self._sureness.is_same(found, curve) for curve in before)
 
     def _take_closer(self, search: Closer, outcome: Outcome) -> None:
         assert isinstance(outcome.found, Initialization)
