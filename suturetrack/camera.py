@@ -138,14 +138,20 @@ class StereoRig:
         return StereoRig(size, left, right, self.metres_per_unit)
 
     def with_row_offset(self, rows: float) -> StereoRig:
-        """The rig whose right view shows everything `rows` px lower than this one's."""
+        """The rig whose right view shows everything `rows` px lower, against the left one, than here.
+
+        Nobody can tell which view is off: each is taken to be off by half of it.
+        """
         if not rows:
             return self
-        lower = np.array([[1.0, 0, 0], [0, 1, rows], [0, 0, 1]])
-        right = replace(
-            self.right, matrix=lower @ self.right.matrix, projection=lower @ self.right.projection
+        left, right = (
+            replace(c, matrix=lower @ c.matrix, projection=lower @ c.projection)
+            for c, lower in (
+                (self.left, np.array([[1.0, 0, 0], [0, 1, -rows / 2], [0, 0, 1]])),
+                (self.right, np.array([[1.0, 0, 0], [0, 1, rows / 2], [0, 0, 1]])),
+            )
         )
-        return replace(self, right=right)
+        return replace(self, left=left, right=right)
 
     @cached_property
     def is_rectified(self) -> bool:

@@ -371,25 +371,59 @@ def test_the_unit_does_not_matter(rig: StereoRig, curve: Nurbs, baseline: float)
     assert there.confidence == pytest.approx(here.confidence)
 
 
-@pytest.mark.parametrize("rows", [-2, 1])
-def test_rows_off_the_calibration_are_noticed_and_do_not_spoil_the_curve(rows: int) -> None:
+@pytest.mark.parametrize("rows", [-4.0, -2.0, -0.6, 0.4, 1.0])
+def test_rows_off_the_calibration_are_measured_and_do_not_spoil_the_curve(rows: float) -> None:
     scene = open_scene("figure8-175", 3, picture=Picture("black", "plain"))
     left, right = scene.render(0)
-    moved = np.roll(right, rows, axis=0)
+    shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, rows]])
+    size = scene.rig.image_size
+    moved = cv2.warpAffine(right, shift, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP)
     seed = Seed(pixel=scene.seed_pixel(0))
     segmenter = Segmenter(scene.rig)
-    lengths = {}
+    found = {}
     for name, view in (("right", right), ("moved", moved)):
         frame = StereoFrame(Stamp(0, 0, 0), left, view)
         segmenter.learn(frame, seed)
-        found = initialize(segmenter.step(frame), scene.rig, seed)
-        lengths[name] = nurbs.length(found.curve)
-        if name == "moved":
-            way = "lower" if rows > 0 else "higher"
-            assert found.reasons[0].startswith(f"the right view lies {abs(rows)} px {way}")
-    assert lengths["moved"] == pytest.approx(lengths["right"], rel=0.13)
-    lowered = scene.rig.with_row_offset(rows)
-    point = scene.truth(0)[0].points[:1]
-    assert lowered.project(point)[1] - scene.rig.project(point)[1] == pytest.approx(
-        np.array([[0.0, rows]])
-    )
+        found[name] = initialize(segmenter.step(frame), scene.rig, seed)
+    level, off = found["right"], found["moved"]
+    assert level.row_offset_px == 0
+    assert off.row_offset_px == pytest.approx(rows, abs=0.1)
+    way = "lower" if rows > 0 else "higher"
+    assert off.reasons[0].startswith(f"the right view lies {abs(off.row_offset_px):.1f} px {way}")
+    assert nurbs.length(off.curve) == pytest.approx(nurbs.length(level.curve), rel=0.03)
+    # Each view is taken to be off by half of it.
+    truth, rig = scene.truth(0)[0].points, scene.rig
+    shown = rig.with_row_offset(off.row_offset_px).project(dense(off.curve))
+    places = zip(shown, rig.project(truth), (0.0, rows), strict=True)
+    for curve, thread, lower in places:
+        assert polyline_distances(curve, thread + np.array([0.0, lower])).max() < 1
+
+
+def test_rows_that_a_thread_cannot_show_are_those_of_the_calibration() -> None:
+    scene = open_scene("pull-through", 209)
+    frame = StereoFrame(STAMP, *scene.render(0))
+    seed = Seed(pixel=scene.seed_pixel(0))
+    segmenter = Segmenter(scene.rig)
+    segmenter.learn(frame, seed)
+    assert initialize(segmenter.step(frame), scene.rig, seed).row_offset_px == 0
+
+
+def test_a_thread_along_the_seam_of_another_is_not_drawn_off_it() -> None:
+    scene = open_scene("clutter", 206)
+    frame = StereoFrame(STAMP, *scene.render(0))
+    seed = Seed(pixel=scene.seed_pixel(0))
+    segmenter = Segmenter(scene.rig)
+    segmenter.learn(frame, seed)
+    found = initialize(segmenter.step(frame), scene.rig, seed)
+    error = curve_error(dense(found.curve), scene.truth(0)[0].points)
+    assert 1000 * scene.rig.metres_per_unit * error.rms < 0.3
+
+
+def test_an_end_that_the_views_cut_on_different_rows_does_not_fold(rig: StereoRig) -> None:
+    t = np.linspace(0, 1, 1500)[:, None]
+    truth = np.c_[40 * t - 20 + 8 * np.sin(9 * t), 40 * t - 20, 200 + 10 * t]
+    left, right = rig.project(truth)
+    cut = right[right[:, 1] > right[0, 1] + 5]
+    seed = Seed(pixel=tuple(left[700]))
+    found = initialize(field_of(draw(left, rig), draw(cut, rig), rig), rig, seed)
+    assert curve_error(dense(found.curve), truth).largest < 2

@@ -8,6 +8,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.confidence import judge
+from suturetrack.initialization.crest import View
 from suturetrack.initialization.ends import move_end, read_end
 from suturetrack.initialization.fitting import fit_marks, image_parameters, refine
 from suturetrack.initialization.growth import Thread, follow_thread, grow_thread, nearest_segment
@@ -21,8 +22,8 @@ from suturetrack.initialization.model import (
     ViewGrowth,
 )
 from suturetrack.initialization.segments import Ridges, find_ridges, thread_scale
-from suturetrack.nurbs import length
-from suturetrack.types import Float32, Float64, InputError, RidgeField, Seed
+from suturetrack.nurbs import curve_from
+from suturetrack.types import Float32, Float64, InputError, Nurbs, RidgeField, Seed
 
 __all__ = [
     "Growth",
@@ -35,8 +36,6 @@ __all__ = [
 
 
 _SHORTEST_STEPS = 4
-_SPOILT = 0.12
-"""How far the lengths of two curves are apart, as a logarithm, if the rows of one spoil it."""
 _LEAST_MATCH = 0.35
 """Median response of the right view, against the left one, below which it shows another scene."""
 
@@ -57,7 +56,7 @@ def initialize(
     left = find_ridges(field.left, config)
     scale = thread_scale(left, pixel)
     if scale == 1:
-        return _initialize(field, left, rig, pixel, config, 1)
+        return _with_rows_told(_initialize(field, left, rig, pixel, config, 1))
     # A wide thread is looked at from farther away: all that follows is made for a narrow one.
     reduced = RidgeField(field.stamp, *(_reduced(v, scale) for v in (field.left, field.right)))
     try:
@@ -66,11 +65,23 @@ def initialize(
     except InitializationError as error:
         growth = None if error.growth is None else error.growth.enlarged(scale, field.left.shape)
         raise InitializationError(error.reason, scale * error.candidates, growth) from None
-    return replace(
-        found,
-        reprojection_px=scale * found.reprojection_px,
-        growth=found.growth.enlarged(scale, field.left.shape),
+    return _with_rows_told(
+        replace(
+            found,
+            reprojection_px=scale * found.reprojection_px,
+            row_offset_px=scale * found.row_offset_px,
+            growth=found.growth.enlarged(scale, field.left.shape),
+        )
     )
+
+
+def _with_rows_told(found: Initialization) -> Initialization:
+    if not found.row_offset_px:
+        return found
+    way = "lower" if found.row_offset_px > 0 else "higher"
+    rows = abs(found.row_offset_px)
+    said = f"the right view lies {rows:.1f} px {way} than the calibration says"
+    return replace(found, reasons=(said, *found.reasons))
 
 
 def _initialize(
@@ -104,12 +115,18 @@ def _initialize(
         if found is None:
             raise
         return found
-    # The calibration stands unless its rows spoil the curve.
-    if found is None or abs(np.log(length(found.curve) / length(other.curve))) > _SPOILT:
-        found = replace(other, row_offset_px=scale * rows)
-    way = "lower" if rows > 0 else "higher"
-    said = f"the right view lies {abs(scale * rows)} px {way} than the calibration says"
-    return replace(found, reasons=(said, *found.reasons))
+    # Those rows are believed that the crests of both views then ask to move least.
+    if found is not None and abs(found.row_offset_px) <= abs(other.row_offset_px):
+        return found
+    total = rows + other.row_offset_px
+    return replace(other, curve=_shared(other.curve, rows, rig), row_offset_px=total)
+
+
+def _shared(curve: Nurbs, rows: float, rig: StereoRig) -> Nurbs:
+    """A curve on the rows of the left view, half as far from those of the right view's `rows` lower."""
+    points = curve.control_points.copy()
+    points[:, 1] += rows / 2 * points[:, 2] / rig.left.projection[1, 1]
+    return curve_from(curve.degree, curve.knots, points)
 
 
 def _reconstruct(
@@ -140,14 +157,19 @@ def _reconstruct(
     s = image_parameters(pixels[:, :2], pixels[:, 2:])
     points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
     curve = fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
+    views = (
+        View(field.left, found.left.others),
+        View(field.right, np.empty((0, 2)) if found.right is None else found.right.others),
+    )
     try:
-        curve, samples, sigma = refine(curve, (field.left, field.right), rig)
+        curve, samples, sigma, rows = refine(curve, views, rig)
     except FloatingPointError as error:
         raise InitializationError(
             f"no curve fits both views: {error}", candidates, growth
         ) from None
-    confidence, reasons = judge(curve, samples, sigma, found.chains, ridges, rig, scale)
-    return Initialization(curve, confidence, reasons, samples.distance_px, growth)
+    shown = rig.with_row_offset(rows)
+    confidence, reasons = judge(curve, samples, sigma, found.chains, ridges, shown, scale)
+    return Initialization(curve, confidence, reasons, samples.distance_px, growth, rows)
 
 
 def _reduced(view: Float32, scale: int) -> Float32:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from suturetrack.kernels import search
 from suturetrack.types import Float32, Float64
@@ -19,6 +20,27 @@ _WIDENED = 12
 """Power of the width beyond that by which such a crest counts less."""
 _CENTROID_REACH = 4
 """Offsets on each side of the peak whose centroid is the crest."""
+_ASIDE_PX = 5.0
+"""Distance up to which another strand draws a crest aside."""
+_DRAWN = 0.1
+"""How much such a crest counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Where the crests of a thread are looked for, and near what they are not to be believed."""
+
+    field: Float32
+    """(H, W, 2)."""
+    others: Float64
+    """(k, 2) pixels on the ridges of other strands, about 1 px apart."""
+
+    def clear(self, pixels: Float64) -> Float64:
+        """(k,) in [0, 1]: low where another strand draws the crest at (k, 2) pixels aside."""
+        if not len(self.others):
+            return np.ones(len(pixels))
+        distance, _ = cKDTree(self.others).query(pixels, distance_upper_bound=_ASIDE_PX)
+        return np.where(np.isfinite(distance), _DRAWN, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +54,8 @@ class Crest:
     response: Float64
     """(k,) eq. (4)'s integrand at the crest, in [0, 1]; 0 where it is unseen."""
     clear: Float64
-    """(k,) in [0, 1]; low where the ridge is wider than elsewhere: another strand draws its crest
-    aside."""
+    """(k,) in [0, 1]; low where the ridge is wider than elsewhere, or near that of another strand,
+    which draws the crest aside."""
 
     @property
     def trust(self) -> Float64:
@@ -41,11 +63,11 @@ class Crest:
         return self.clear * self.response / (1 + self.offsets**2)
 
 
-def find_crest(field: Float32, pixels: Float64) -> Crest:
+def find_crest(view: View, pixels: Float64) -> Crest:
     """Looks for the crest across (k, 2) evenly spaced pixels of a projected curve."""
     tangents = np.gradient(pixels, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-    profiles = search.normal_profiles(field, pixels, tangents, _OFFSETS, 0.0)
+    profiles = search.normal_profiles(view.field, pixels, tangents, _OFFSETS, 0.0)
     expected = profiles * np.exp(-0.5 * (_OFFSETS / _NEAR_PX) ** 2)
     peak = np.argmax(expected, axis=1)
     around = np.arange(-_CENTROID_REACH, _CENTROID_REACH + 1)
@@ -60,6 +82,5 @@ def find_crest(field: Float32, pixels: Float64) -> Crest:
     wider = np.maximum(spread / max(_WIDE * usual, 1e-12), 1.0)
     heights = np.take_along_axis(profiles, peak[:, None], 1)[:, 0]
     normals = np.c_[-tangents[:, 1], tangents[:, 0]]
-    return Crest(
-        normals, np.where(seen, offsets, 0.0), np.where(seen, heights, 0.0), wider**-_WIDENED
-    )
+    clear = wider**-_WIDENED * view.clear(pixels)
+    return Crest(normals, np.where(seen, offsets, 0.0), np.where(seen, heights, 0.0), clear)

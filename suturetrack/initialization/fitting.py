@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,10 +10,10 @@ from scipy.ndimage import gaussian_filter1d
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization.crest import Crest, find_crest
+from suturetrack.initialization.crest import Crest, View, find_crest
 from suturetrack.initialization.ends import EndReading, read_end
 from suturetrack.kernels import spline
-from suturetrack.types import Float32, Float64, Nurbs
+from suturetrack.types import Float64, Nurbs
 
 DEGREE = spline.DEGREE
 SPACING_PX = 2.0
@@ -35,6 +35,13 @@ _RIDGE = 1e-9
 _END_NOISE_PX = 0.2
 _ROW_NOISE_PX = 0.1
 """By how much the rows of two calibrated views are off, px."""
+_OFF_PX = 0.2
+"""By how much the rows of two views have to be off, at least, for that to be told from the bunching of
+depth along the epipolar lines: calibrated ones seem to be off by up to 0.05."""
+_SURELY = 4.0
+"""Standard deviations by which they have to seem off, at least."""
+_ANY_SLIP_PX = 1.0
+"""What the rows may be off where no crest tells, px (standard deviation)."""
 _LARGEST_END_STEP_PX = 2.0
 _BEND_SAMPLES = 8.0
 """Samples over which the visible bending is averaged."""
@@ -79,7 +86,7 @@ class Samples:
     """View, end: where the thread ends."""
 
     @classmethod
-    def of(cls, curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig) -> Samples:
+    def of(cls, curve: Nurbs, views: tuple[View, View], rig: StereoRig) -> Samples:
         """Samples `curve` and looks for the crests beside it.
 
         Raises:
@@ -97,11 +104,12 @@ class Samples:
         s = np.interp(np.linspace(0, travelled[-1], count), travelled, fine)
         points = nurbs.evaluate(curve, s)
         pixels = rig.project(points)
-        left, right = (find_crest(f, p) for f, p in zip(fields, pixels, strict=True))
+        left, right = (find_crest(v, p) for v, p in zip(views, pixels, strict=True))
         outward = np.array([[p[0] - p[1], p[-1] - p[-2]] for p in pixels])
         outward /= np.maximum(np.linalg.norm(outward, axis=2, keepdims=True), 1e-9)
         ends_left, ends_right = (
-            (read_end(f, p), read_end(f, p[::-1])) for f, p in zip(fields, pixels, strict=True)
+            (read_end(v.field, p), read_end(v.field, p[::-1]))
+            for v, p in zip(views, pixels, strict=True)
         )
         return cls(
             s,
@@ -112,6 +120,13 @@ class Samples:
             outward,
             (ends_left, ends_right),
         )
+
+    @property
+    def rows_between_ends(self) -> Float64:
+        """(2,) on how different rows the two views show each end; 0 where one does not tell, px."""
+        offsets = np.array([[reading.offset_px for reading in ends] for ends in self.ends])
+        left, right = offsets * self.outward[:, :, 1]
+        return np.nan_to_num(left - right)
 
     @property
     def distance_px(self) -> float:
@@ -128,8 +143,8 @@ class Samples:
 
 
 def refine(
-    curve: Nurbs, fields: tuple[Float32, Float32], rig: StereoRig
-) -> tuple[Nurbs, Samples, Float64]:
+    curve: Nurbs, views: tuple[View, View], rig: StereoRig
+) -> tuple[Nurbs, Samples, Float64, float]:
     """Gauss-Newton on the crests of both views, as smooth as the evidence says, with few knots.
 
     Bending is measured in pixels, across the line of sight and in disparity apart, because the
@@ -138,20 +153,46 @@ def refine(
 
     Args:
         curve: within a few pixels of the crests, with knots enough for any shape.
-        fields: (H, W, 2) left and right.
+        views: left and right.
         rig: the cameras.
 
     Returns:
-        The curve, what the images show beside it, and (k,) the standard deviations of its samples.
+        The curve, what the images show beside it, (k,) the standard deviations of its samples, and
+        how many px lower than the cameras say the right view shows the thread; 0 in doubt.
     """
-    stiffness = np.array([1.0, 100.0])
-    for _ in range(_DENSE_ROUNDS):
-        curve, stiffness = _step(curve, Samples.of(curve, fields, rig), stiffness)
-    curve = with_needed_knots(Samples.of(curve, fields, rig))
-    for _ in range(_FINAL_ROUNDS):
-        curve, stiffness = _step(curve, Samples.of(curve, fields, rig), stiffness)
-    samples = Samples.of(curve, fields, rig)
-    return curve, samples, deviations(curve, samples, stiffness)
+    start = _Fit(curve, np.array([1.0, 100.0]))
+    fit = start.improved(views, rig, _DENSE_ROUNDS)
+    if abs(fit.slip_px) > max(_OFF_PX, _SURELY * fit.slip_sigma_px):
+        fit = replace(fit, is_level=False).improved(views, rig, _DENSE_ROUNDS)
+    fit = replace(fit, curve=with_needed_knots(fit.samples(views, rig)))
+    fit = fit.improved(views, rig, _FINAL_ROUNDS)
+    samples = fit.samples(views, rig)
+    return fit.curve, samples, deviations(fit.curve, samples, fit.stiffness), fit.rows
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A curve on its way to the crests."""
+
+    curve: Nurbs
+    stiffness: Float64
+    """(2,) what holds back the bending across the line of sight, and that in disparity."""
+    is_level: bool = True
+    """Whether the views are taken to be on the rows of the calibration."""
+    rows: float = 0.0
+    """By how many px the right view is taken to be lower."""
+    slip_px: float = 0.0
+    """By how many more the crests would have it."""
+    slip_sigma_px: float = np.inf
+
+    def samples(self, views: tuple[View, View], rig: StereoRig) -> Samples:
+        return Samples.of(self.curve, views, rig.with_row_offset(self.rows))
+
+    def improved(self, views: tuple[View, View], rig: StereoRig, rounds: int) -> _Fit:
+        fit = self
+        for _ in range(rounds):
+            fit = _step(fit, fit.samples(views, rig))
+        return fit
 
 
 def deviations(curve: Nurbs, samples: Samples, stiffness: Float64) -> Float64:
@@ -166,12 +207,8 @@ def deviations(curve: Nurbs, samples: Samples, stiffness: Float64) -> Float64:
         raise FloatingPointError("the curve is not held by the images")
     first, table = spline.local_basis(samples.s, curve.knots)
     covariance = spline.sample_covariance(first, table[0], spline.band_of_inverse(factor))
-    band, gradient = _empty(curve)
-    crest, jacobian = samples.crests[1], samples.jacobians[1]
-    rows = np.einsum("ki,kij->kj", crest.normals, jacobian)
-    slip = (crest.trust * crest.normals[:, 1])[:, None] * rows
-    spline.add_rows(first, table[0], np.zeros((len(rows), 3, 3)), slip, band, gradient)
-    step = _ROW_NOISE_PX * spline.solve_factorized(factor, gradient / noise)
+    mixed, _, _ = _slip_equations(curve, samples)
+    step = _ROW_NOISE_PX * spline.solve_factorized(factor, mixed / noise)
     moved = spline.combine(first, table[0], step.reshape(-1, 3))
     return np.sqrt(np.trace(covariance, axis1=1, axis2=2) + (moved**2).sum(1))
 
@@ -226,27 +263,53 @@ def _closest(knots: Float64, s: Float64, points: Float64, information: Float64) 
     return nurbs.curve_from(DEGREE, knots, control_points)
 
 
-def _step(curve: Nurbs, samples: Samples, stiffness: Float64) -> tuple[Nurbs, Float64]:
+def _step(fit: _Fit, samples: Samples) -> _Fit:
+    curve, stiffness = fit.curve, fit.stiffness.copy()
     noise = max(samples.noise_px, _LEAST_NOISE_PX) ** 2
     data, pull = _crest_equations(curve, samples)
     _add_ends(data, pull, samples, noise)
     across, bends = _bending_equations(curve, samples)
+    mixed, weight, shown = _slip_equations(curve, samples)
     c = curve.control_points.ravel()
     free = len(c) // 3 - 2
-    step = np.zeros_like(c)
+    step, slip, held_by = np.zeros_like(c), 0.0, 1.0
     for _ in range(_EVIDENCE_STEPS):
         factor = data / noise + stiffness[0] * across + stiffness[1] * bends
         if not spline.factorize(factor):
             raise FloatingPointError("the curve is not held by the images")
         smoothing = stiffness[0] * across + stiffness[1] * bends
         step = spline.solve_factorized(factor, pull / noise - _times(smoothing, c))
+        # The slip is one more unknown, beside the band.
+        per_px = spline.solve_factorized(factor, mixed / noise)
+        held_by = weight - mixed @ per_px + noise / _ANY_SLIP_PX**2
+        slip = (shown - mixed @ step) / held_by
+        step = step if fit.is_level else step - slip * per_px
         inverse = spline.band_of_inverse(factor)
         for k, (energy, rank) in enumerate(((across, 2 * free), (bends, free))):
             held = rank - stiffness[k] * _trace(inverse, energy)
             bend = (c + step) @ _times(energy, c + step)
             stiffness[k] = min(max(held, 1.0) / max(bend, 1e-12), _STIFFEST)
     points = curve.control_points + step.reshape(-1, 3)
-    return nurbs.curve_from(curve.degree, curve.knots, points), stiffness
+    rows = fit.rows if fit.is_level else fit.rows + slip
+    curve = nurbs.curve_from(curve.degree, curve.knots, points)
+    return _Fit(curve, stiffness, fit.is_level, rows, slip, float(np.sqrt(noise / held_by)))
+
+
+def _slip_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, float, float]:
+    """What the crests say about a slip of the right view's rows against the left one's: together
+    with the control points, (3n,), its own weight, and what pulls at it."""
+    first, table = spline.local_basis(samples.s, curve.knots)
+    band, gradient = _empty(curve)
+    weight = pull = 0.0
+    nothing = np.zeros((len(samples.s), 3, 3))
+    for side, crest, jacobian in zip((-0.5, 0.5), samples.crests, samples.jacobians, strict=True):
+        down = side * crest.normals[:, 1]
+        rows = np.einsum("ki,kij->kj", crest.normals, jacobian)
+        mixed = (crest.trust * down)[:, None] * rows
+        spline.add_rows(first, table[0], nothing, mixed, band, gradient)
+        weight += float(crest.trust @ down**2)
+        pull += float(crest.trust @ (down * crest.offsets))
+    return gradient, weight, pull
 
 
 def _crest_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, Float64]:
@@ -284,14 +347,18 @@ def _stay(samples: Samples) -> Float64:
 
 
 def _add_ends(band: Float64, gradient: Float64, samples: Samples, noise: float) -> None:
-    """Rows that draw the ends of the curve along itself to those of the thread."""
+    """Rows that draw the ends of the curve along itself to those of the thread.
+
+    Views that show an end on different rows are not to be reconciled by its depth.
+    """
+    apart = samples.rows_between_ends
     for view, jacobian in enumerate(samples.jacobians):
         for end in (0, 1):
             reading = samples.ends[view][end]
             if np.isnan(reading.offset_px):
                 continue
             row = samples.outward[view, end] @ jacobian[-end]
-            weight = noise / _END_NOISE_PX**2
+            weight = noise / (_END_NOISE_PX**2 + apart[end] ** 2 / 4)
             at = (len(gradient) - 3) * end
             offset = np.clip(reading.offset_px, -_LARGEST_END_STEP_PX, _LARGEST_END_STEP_PX)
             gradient[at : at + 3] += weight * offset * row

@@ -74,6 +74,15 @@ class Thread:
         """The segments in order, each run in the direction of the thread."""
         return [self.ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in self.entries]
 
+    @property
+    def others(self) -> Float64:
+        """(k, 2) pixels on the ridges of other strands, as clear as the thread's or shared with it."""
+        ridges, own = self.ridges, {e // 2 for e in self.entries}
+        level = _FAINT * float(np.median(ridges.sample(self.chain.pixels)))
+        rest = [s for k, s in enumerate(ridges.segments) if k not in own]
+        clear = [s for s in rest if np.median(ridges.sample(s)) > level]
+        return np.concatenate([np.empty((0, 2)), *clear])
+
 
 def follow_thread(
     ridges: Ridges, origin: int, config: InitializationConfig, depth: Depth | None = None

@@ -77,8 +77,9 @@ class Initialization:
     reprojection_px: float
     """Mean distance of the projected curve from the crest of the ridge, both views, px."""
     growth: Growth
-    row_offset_px: int = 0
-    """How much lower than the calibration says the right view lies; 0 where the curve bears it."""
+    row_offset_px: float = 0.0
+    """How much lower, against the left view, than the calibration says the right view lies; the curve
+    is half of it off in each. 0 where that cannot be told from none."""
 
 
 class InitializationError(Exception):
