@@ -19,7 +19,7 @@ from suturetrack.contrast import (
     contrast_along,
     contrast_at,
 )
-from suturetrack.kernels import ridge, sides
+from suturetrack.kernels import ridge
 from suturetrack.silhouette import is_cut_out, silhouette_scale, silhouettes
 from suturetrack.types import Float32, Float64, Image, InputError, RidgeField, Seed, StereoFrame
 
@@ -70,9 +70,6 @@ class SegmentationConfig:
     polarity: Polarity = "auto"
     """Whether the thread is darker or brighter than its surroundings. `auto`: dark until a seed
     shows otherwise."""
-    two_sided: bool = True
-    """Whether a ridge must stand out from both of its sides, as the edge of a tool and the rim of a
-    highlight do not. Eq. (1) alone does not ask."""
     adapt: bool = True
     """Whether what was learned of a thread follows, once a second, how it looks along its curve."""
 
@@ -288,7 +285,6 @@ class _View:
         self._channels = [np.empty((height, width), np.uint8) for _ in range(3)]
         self._strength = np.empty(((height + 3) // 4, width), np.float32)
         self._outputs = np.empty((_SLOTS, height, width, 2), np.float32)
-        self._smooth = np.empty((height, width), np.float32)
         self._relative_c: float | None = None
         self._brightness = 1.0
         self._c: float | None = None
@@ -307,19 +303,13 @@ class _View:
             ridge.mix_channels(*self._channels, weights, self.plane)
 
     def filter(self, plane: Float32, look: _Look, slot: int) -> Float32:
-        """Eq. (1), Algorithm 1 and what keeps edges out, on the rectified plane, into the slot's buffer."""
+        """Eq. (1) and Algorithm 1 on the rectified plane, into the slot's buffer."""
         out, c = self._outputs[slot], self._config.c or self._c
         if c is None:
             self._find_ridges_by_their_quantile(plane, look, out)
         else:
             self._find_ridges(plane, look, c, out)
-        if self._config.two_sided:
-            self._fade_edges(plane, look, out)
         return out
-
-    def _fade_edges(self, plane: Float32, look: _Look, out: Float32) -> None:
-        cv2.GaussianBlur(plane, (0, 0), max(min(look.sigmas) / 2, 1.0), self._smooth)
-        sides.fade_edges(self._smooth, np.array(look.sigmas, np.float32), look.signs, out)
 
     def _find_ridges_by_their_quantile(self, plane: Float32, look: _Look, out: Float32) -> None:
         if self._relative_c is None:

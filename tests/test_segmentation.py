@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tracemalloc
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.special import expit
 
 from suturetrack.camera import StereoRig
 from suturetrack.contrast import GRAY, SIGMAS, contrast_at
-from suturetrack.kernels import ridge, sides
+from suturetrack.kernels import ridge
 from suturetrack.segmentation import (
     SegmentationConfig,
     Segmenter,
@@ -39,11 +38,9 @@ def small_rig(width: int, height: int) -> StereoRig:
     return StereoRig.from_calibration((width, height), (k, none), (k, none), np.eye(3), shift, 1e-3)
 
 
-def segment(left: Image, config: SegmentationConfig, *, two_sided: bool = False) -> Float32:
-    segmenter = Segmenter(
-        small_rig(left.shape[1], left.shape[0]), replace(config, two_sided=two_sided)
-    )
-    return segmenter.step(StereoFrame(STAMP, left, left)).left
+def segment(left: Image, config: SegmentationConfig, right: Image | None = None) -> Float32:
+    segmenter = Segmenter(small_rig(left.shape[1], left.shape[0]), config)
+    return segmenter.step(StereoFrame(STAMP, left, left if right is None else right)).left
 
 
 def literal(image: Image, config: SegmentationConfig) -> Float64:
@@ -125,18 +122,6 @@ def test_any_size_and_layout_gives_the_literal_field(
     assert np.linalg.norm(field, axis=-1).max() <= 1 + 1e-6
 
 
-@pytest.mark.parametrize("polarity", ["dark", "bright", "both"])
-def test_edges_fade_as_in_the_literal_twin(polarity: str) -> None:
-    config = SegmentationConfig(c=6.0, channel="gray", polarity=polarity)
-    image = open_scene("crossings", 11).render(0)[0]
-    plane = cv2.GaussianBlur((image @ GRAY).astype(np.float32), (0, 0), 1.0)
-    field = segment(image, config)
-    signs = {"dark": (1.0, 1.0), "bright": (-1.0, -1.0), "both": (-1.0, 1.0)}[polarity]
-    twin = reference.fade_edges(plane.astype(float), 1.2, signs, field.astype(float))
-    sides.fade_edges(plane, np.float32([1.2]), signs, field)
-    assert np.mean(np.abs(field - twin).max(-1) > 1e-3) <= 1e-4
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_vectors_at_right_angles_are_subtracted(seed: int) -> None:
     """Algorithm 1 adds where d > 0 and subtracts where d = 0, however the zeros are signed."""
@@ -194,44 +179,16 @@ def test_polarity_decides_which_threads_are_seen(polarity: str, dark: bool, seen
     assert (np.linalg.norm(field[40, 40]) > 0.3) == seen
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.4, 1.3])
-@pytest.mark.parametrize("dark", [True, False])
-def test_a_ridge_has_two_sides(angle: float, dark: bool) -> None:
-    """The edge of a tool is no thread, although eq. (1) sees one on its dark side."""
-    config = SegmentationConfig(c=10.0, polarity="dark" if dark else "bright")
-    thread, edge = (line_image(angle, width, dark, 161) for width in (2.0, 60.0))
-
-    def strongest(image: Image, *, two_sided: bool) -> float:
-        inside = segment(image, config, two_sided=two_sided)[20:-20, 20:-20]
-        return float(np.linalg.norm(inside, axis=-1).max())
-
-    assert strongest(edge, two_sided=False) > 0.4
-    assert strongest(edge, two_sided=True) < 0.1
-    np.testing.assert_array_equal(
-        segment(thread, config, two_sided=True)[60:100, 60:100],
-        segment(thread, config, two_sided=False)[60:100, 60:100],
-    )
-
-
-def test_a_thread_before_an_edge_keeps_its_ridge() -> None:
-    config = SegmentationConfig(c=10.0)
-    image = line_image(0.0, 2.0).astype(int)
-    image[41:] += 60
-    field = segment(image.clip(0, 255).astype(np.uint8), config, two_sided=True)
-    assert np.linalg.norm(field[40, 40]) > 0.5
-
-
-@pytest.mark.parametrize("two_sided", [True, False])
-def test_several_scales_see_thin_and_wide_threads(two_sided: bool) -> None:
+def test_several_scales_see_thin_and_wide_threads() -> None:
     image = np.minimum(
         np.roll(line_image(0.0, 1.5, size=121), -40, 0),
         np.roll(line_image(0.0, 12.0, size=121), 20, 0),
     )
     rows = np.array([20, 80])
     strength = {
-        sigmas: np.linalg.norm(
-            segment(image, SegmentationConfig(sigmas, c=10.0), two_sided=two_sided), axis=-1
-        )[rows, 60]
+        sigmas: np.linalg.norm(segment(image, SegmentationConfig(sigmas, c=10.0)), axis=-1)[
+            rows, 60
+        ]
         for sigmas in [(1.0,), (5.0,), (1.0, 5.0)]
     }
     assert strength[(1.0,)][1] < 0.1 < 0.4 < strength[(1.0,)][0]

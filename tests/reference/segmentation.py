@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
-from scipy import ndimage
 
 
 def gaussian_derivatives(sigma):
@@ -83,29 +81,3 @@ def gaussian_kernel(sigma):
     offsets = np.arange(-2, 3, dtype=float)
     kernel = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * sigma**2))
     return kernel / kernel.sum()
-
-
-def fade_edges(plane, sigma, signs, field):
-    """The vectors, shortened where no crest within three sigmas stands out from both sides."""
-    height, width = plane.shape
-    length = np.linalg.norm(field, axis=-1, keepdims=True)
-    across = sigma * np.stack([-field[..., 1], field[..., 0]], -1) / np.maximum(length, 1e-12)
-    v, u = np.mgrid[:height, :width]
-
-    def brightness(offset):
-        pixels = [v + offset * across[..., 1], u + offset * across[..., 0]]
-        return ndimage.map_coordinates(plane, pixels, order=1, mode="nearest")
-
-    def profile(crest, side):
-        middle, before, behind = (brightness(crest + offset) for offset in (0, -side, side))
-        return before, behind, before + behind - 2 * middle
-
-    worth, own = np.zeros((height, width)), np.abs(profile(0, 1.5)[2])
-    for crest, side in itertools.product((-3, -2, -1, 0, 1, 2, 3), (1.5, 3, 4.5)):
-        before, behind, depth = profile(crest, side)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            lopsided = np.abs(behind - before) / np.abs(depth)
-        sign = np.sign(depth)
-        fits = (sign >= signs[0]) & (sign <= signs[1]) & (np.abs(depth) > own / 2)
-        worth = np.fmax(worth, np.where(fits, np.clip((1 - lopsided) / 0.25, 0, 1), 0))
-    return np.where(length > 0.05, worth[..., None] * field, field)
