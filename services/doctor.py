@@ -226,11 +226,10 @@ def _troubles(watch: RigWatch) -> Iterator[Finding]:
     for name, (health, _) in sorted(watch.health.items()):
         subject = f"{watch.rig}: {name}"
         awaited = _awaited(health)
-        if awaited in watch.unheard:
-            advice = f"start the {awaited}, as above; this process then goes on by itself"
-            yield Finding(WARNING, subject, health.warning, advice)
-        elif awaited:
+        if awaited:
             advice = f"it goes on by itself; if it does not, see the log of the {awaited}"
+            if awaited in watch.unheard:
+                advice = f"start the {awaited}, as above; this process then goes on by itself"
             yield Finding(WARNING, subject, health.warning, advice)
         elif health.warning:
             yield Finding(ERROR, subject, health.warning, "see its log")

@@ -84,12 +84,10 @@ class Pulse:
         silent_s = self._looked - beat.at
         if silent_s > _SILENT_S:
             return _silence(silent_s)
-        if not beat.health.ready:
-            is_late = beat.still > longest_still(beat.health)
-            return f"it was not ready after {beat.still} s" if is_late else ""
-        if beat.still > longest_still(beat.health):
-            return f"it finished no frame for {beat.still} s"
-        return ""
+        if beat.still <= longest_still(beat.health):
+            return ""
+        failing = "finished no frame for" if beat.health.ready else "was not ready after"
+        return f"it {failing} {beat.still} s"
 
 
 def longest_still(health: Health) -> float:

@@ -13,7 +13,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
 from suturetrack.metrics import curve_error, polyline_distances
 from suturetrack.segmentation import Segmenter
-from suturetrack.stage import Picture, open_scene
+from suturetrack.stage import Picture, Scene, open_scene
 from suturetrack.types import (
     Float64,
     Image,
@@ -44,6 +44,14 @@ def draw(pixels: Float64, rig: StereoRig, image: Image | None = None, width: int
 
 def field_of(left: Image, right: Image, rig: StereoRig) -> RidgeField:
     return Segmenter(rig).step(StereoFrame(STAMP, left, right))
+
+
+def field_and_seed(scene: Scene) -> tuple[RidgeField, Seed]:
+    """The first field of a scene, and a seed that its segmenter has learned from."""
+    seed, segmenter = Seed(pixel=scene.seed_pixel(0)), Segmenter(scene.rig)
+    frame = StereoFrame(STAMP, *scene.render(0))
+    segmenter.learn(frame, seed)
+    return segmenter.step(frame), seed
 
 
 def dense(curve: Nurbs, count: int = 1500) -> Float64:
@@ -139,11 +147,7 @@ def test_any_seed_gives_the_same_curve_of_a_thread_that_crosses_itself(
     scenario: str, seed: int
 ) -> None:
     scene = open_scene(scenario, seed)
-    frame = StereoFrame(STAMP, *scene.render(0))
-    segmenter = Segmenter(scene.rig)
-    start = Seed(pixel=scene.seed_pixel(0))
-    segmenter.learn(frame, start)
-    field = segmenter.step(frame)
+    field, start = field_and_seed(scene)
     reference = dense(initialize(field, scene.rig, start).curve, 400)
     lines = scene.rig.project(reference)
     for k in (1, 100, 300, 398):
@@ -215,11 +219,8 @@ def test_strands_that_lie_on_each_other_are_both_followed(rig: StereoRig) -> Non
 def test_strands_of_one_thread_are_told_apart(scenario: str, seed: int) -> None:
     """A loop whose ends run into its side, and one that crosses itself closely."""
     scene = open_scene(scenario, seed)
-    frame = StereoFrame(STAMP, *scene.render(0))
-    start = Seed(pixel=scene.seed_pixel(0))
-    segmenter = Segmenter(scene.rig)
-    segmenter.learn(frame, start)
-    found = initialize(segmenter.step(frame), scene.rig, start)
+    field, start = field_and_seed(scene)
+    found = initialize(field, scene.rig, start)
     truth = scene.truth(0)[0].points
     error = curve_error(dense(found.curve), truth)
     assert abs(error.length_percent) < 2
@@ -233,11 +234,8 @@ def test_strands_of_one_thread_are_told_apart(scenario: str, seed: int) -> None:
 def test_a_crossing_that_neither_view_can_tell_is_doubtful() -> None:
     """Another thread runs beside this one, and leaves it more smoothly than it goes on itself."""
     scene = open_scene("clutter", 250)
-    frame = StereoFrame(STAMP, *scene.render(0))
-    start = Seed(pixel=scene.seed_pixel(0))
-    segmenter = Segmenter(scene.rig)
-    segmenter.learn(frame, start)
-    found = initialize(segmenter.step(frame), scene.rig, start)
+    field, start = field_and_seed(scene)
+    found = initialize(field, scene.rig, start)
     is_right = curve_error(dense(found.curve), scene.truth(0)[0].points).rms < 0.3
     assert (found.confidence >= 0.5) == is_right
     assert is_right or any("an ambiguous crossing" in reason for reason in found.reasons)
@@ -401,20 +399,14 @@ def test_rows_off_the_calibration_are_measured_and_do_not_spoil_the_curve(rows: 
 
 def test_rows_that_a_thread_cannot_show_are_those_of_the_calibration() -> None:
     scene = open_scene("pull-through", 209)
-    frame = StereoFrame(STAMP, *scene.render(0))
-    seed = Seed(pixel=scene.seed_pixel(0))
-    segmenter = Segmenter(scene.rig)
-    segmenter.learn(frame, seed)
-    assert initialize(segmenter.step(frame), scene.rig, seed).row_offset_px == 0
+    field, seed = field_and_seed(scene)
+    assert initialize(field, scene.rig, seed).row_offset_px == 0
 
 
 def test_a_thread_along_the_seam_of_another_is_not_drawn_off_it() -> None:
     scene = open_scene("clutter", 206)
-    frame = StereoFrame(STAMP, *scene.render(0))
-    seed = Seed(pixel=scene.seed_pixel(0))
-    segmenter = Segmenter(scene.rig)
-    segmenter.learn(frame, seed)
-    found = initialize(segmenter.step(frame), scene.rig, seed)
+    field, seed = field_and_seed(scene)
+    found = initialize(field, scene.rig, seed)
     error = curve_error(dense(found.curve), scene.truth(0)[0].points)
     assert 1000 * scene.rig.metres_per_unit * error.rms < 0.3
 

@@ -56,8 +56,16 @@ def initialize(
     left = find_ridges(field.left, config)
     scale = thread_scale(left, pixel)
     if scale == 1:
-        return _with_rows_told(_initialize(field, left, rig, pixel, config, 1))
-    # A wide thread is looked at from farther away: all that follows is made for a narrow one.
+        found = _initialize(field, left, rig, pixel, config, 1)
+    else:
+        found = _initialize_from_afar(field, rig, pixel, config, scale)
+    return _with_rows_told(found)
+
+
+def _initialize_from_afar(
+    field: RidgeField, rig: StereoRig, pixel: Float64, config: InitializationConfig, scale: int
+) -> Initialization:
+    """A wide thread is looked at from farther away: all that follows is made for a narrow one."""
     reduced = RidgeField(field.stamp, *(_reduced(v, scale) for v in (field.left, field.right)))
     try:
         left = find_ridges(reduced.left, config)
@@ -65,13 +73,11 @@ def initialize(
     except InitializationError as error:
         growth = None if error.growth is None else error.growth.enlarged(scale, field.left.shape)
         raise InitializationError(error.reason, scale * error.candidates, growth) from None
-    return _with_rows_told(
-        replace(
-            found,
-            reprojection_px=scale * found.reprojection_px,
-            row_offset_px=scale * found.row_offset_px,
-            growth=found.growth.enlarged(scale, field.left.shape),
-        )
+    return replace(
+        found,
+        reprojection_px=scale * found.reprojection_px,
+        row_offset_px=scale * found.row_offset_px,
+        growth=found.growth.enlarged(scale, field.left.shape),
     )
 
 
