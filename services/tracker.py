@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -64,7 +65,7 @@ def run(service: Service, config: TrackerConfig) -> None:
     service.ready()
     gate = Gate(rig, ordered=not config.service.lockstep)
     for ridges in fields:
-        refusal = gate.refusal(ridges)
+        refusal = gate.refusal(ridges, time.monotonic_ns())
         if refusal:
             fields.refuse(refusal)
             continue
