@@ -33,7 +33,7 @@ _PAUSE_S = 1.0
 _MEMORY_S = 60.0
 """Deaths longer ago count neither towards the budget nor for the back-off."""
 _BACK_OFF_S = 0.5
-_LONGEST_BACK_OFF_S = 10.0
+_LONGEST_BACK_OFF_S = 4.0
 
 
 @dataclass(frozen=True)

@@ -188,8 +188,8 @@ def restarts(system: System) -> int:
     return system.said.count("it is started again")
 
 
-def recordings(system: System) -> int:
-    return len(list(system.run_dir.glob("*.rrd")))
+def recordings(system: System, processes: tuple[str, ...]) -> int:
+    return sum(len(list(system.run_dir.glob(f"{process}*.rrd"))) for process in processes)
 
 
 def die_at_random(
@@ -202,7 +202,7 @@ def die_at_random(
         lambda s: seen.setdefault(s.state.stamp.frame, s.state.stamp.released_ns / 1e9)
     )
     system.until_tracking()
-    before, earlier, files = system.client.latest(), restarts(system), recordings(system)
+    before, earlier, files = system.client.latest(), restarts(system), recordings(system, processes)
     assert before is not None
     for _ in range(times):
         for process in processes:
@@ -224,7 +224,8 @@ def die_at_random(
     folder = RunFolder(system.run_dir)
     assert not [p for p in folder.problems if "is no recording" in p]
     assert restarts(system) == earlier + len(deaths)
-    assert len(folder.files) == recordings(system) == files + len(deaths)
+    assert len(folder.files) == recordings(system, PROCESSES)
+    assert recordings(system, processes) == files + len(deaths)
     for process in ("tracker", "source"):
         recorded = folder.handled(process)
         ends = [when for name, when in deaths if name == process]
