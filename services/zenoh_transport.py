@@ -142,18 +142,20 @@ class ZenohTransport:
         config: where to listen and to connect.
         patient: nothing may be lost, for lock-step: wait for slow readers instead of dropping what
             they cannot take, and leave out the shared memory, which is taken back from stalled ones.
+        shares: whether images and fields go through shared memory.
 
     Raises:
         InputError: the session cannot be opened.
     """
 
-    def __init__(self, config: zenoh.Config, *, patient: bool = False):
+    def __init__(self, config: zenoh.Config, *, patient: bool = False, shares: bool = True):
         zenoh.init_log_from_env_or("error")
         try:
             self._session = Session(config)
         except zenoh.ZError as error:
             raise InputError(explain(error)) from error
         self._patient = patient
+        self._shares = shares and not patient
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._pool: ShmProvider | None = None
         self._pooled_size = 0
@@ -161,13 +163,13 @@ class ZenohTransport:
     def put(self, key: str, packet: Packet, *, large: bool) -> None:
         """See `Transport`."""
         payload = bytes(packet.payload)
-        content = self._share(payload) if large and not self._patient else payload
+        content = self._share(payload) if large else payload
         publisher = self._publisher(key, large=large)
         publisher.put(content, encoding=packet.encoding, attachment=packet.attachment)
 
     def make_room(self, size: int) -> None:
         """See `Transport`."""
-        if self._patient or size <= self._pooled_size:
+        if not self._shares or size <= self._pooled_size:
             return
         self._pooled_size = size
         self._pool = _make_pool(size)

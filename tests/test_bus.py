@@ -442,6 +442,37 @@ def test_images_come_through_shared_memory_and_nothing_of_it_stays(rig_name: str
     assert not [file for file in files - _mapped(os.getpid()) if file.exists()]
 
 
+RESTARTED = """
+import sys
+import numpy as np
+from services import topics
+from services.service import ServiceConfig, run
+from suturetrack.types import RidgeField, Stamp
+view = np.zeros((480, 640, 2), np.float32)
+
+def send(service):
+    while not service.bus.stop.wait(0.05):
+        service.bus.publish(topics.FIELD, RidgeField(Stamp(0, 0, 0), view, view))
+
+run("segmenter", ServiceConfig(rig="test", resume=int(sys.argv[1])), send)
+"""
+
+
+@pytest.mark.parametrize(("deaths", "is_shared"), [(7, True), (8, False)])
+def test_who_dies_over_and_over_fills_no_memory_of_its_readers(
+    rig_name: str, deaths: int, is_shared: bool
+) -> None:
+    receiver = ZenohTransport(local_config(rig_name, "tracker"))
+    shared = list[bool]()
+    receiver.subscribe("**/field", lambda _, packet: shared.append(_is_shared(packet)))
+    sender = subprocess.Popen([sys.executable, "-c", RESTARTED, str(deaths)])
+    wait_until(lambda: len(shared) >= 3, 30)
+    sender.terminate()
+    assert sender.wait(30) == 0
+    receiver.close()
+    assert set(shared) == {is_shared}
+
+
 SWEEP = "from services.zenoh_transport import sweep_shared_memory; sweep_shared_memory()"
 
 
