@@ -20,10 +20,9 @@ from cryptography import x509
 from rich.console import Console
 from rich.text import Text
 
-from services.messages import Health
-from services.service import WAITS_FOR
 from services.status import RigWatch, watch_rigs
 from services.tables import new_table
+from services.topics import PROCESSES
 from services.zenoh_transport import socket_directory
 from suturetrack.types import InputError
 
@@ -208,7 +207,7 @@ def _rates(watch: RigWatch) -> Iterator[Finding]:
         return
     wanted = watch.health["source"][0].rate_hz
     for name, (health, _) in sorted(watch.health.items()):
-        if _awaited(health):
+        if health.awaits:
             continue
         if name in ("segmenter", "tracker") and health.rate_hz < _SLOW * wanted:
             text = f"{health.rate_hz:.1f} Hz of {wanted:.1f} Hz"
@@ -225,11 +224,10 @@ def _rates(watch: RigWatch) -> Iterator[Finding]:
 def _troubles(watch: RigWatch) -> Iterator[Finding]:
     for name, (health, _) in sorted(watch.health.items()):
         subject = f"{watch.rig}: {name}"
-        awaited = _awaited(health)
-        if awaited:
-            advice = f"it goes on by itself; if it does not, see the log of the {awaited}"
-            if awaited in watch.unheard:
-                advice = f"start the {awaited}, as above; this process then goes on by itself"
+        if health.awaits in PROCESSES:
+            advice = f"it goes on by itself; if it does not, see the log of the {health.awaits}"
+            if health.awaits in watch.unheard:
+                advice = f"start the {health.awaits}, as above; this process then goes on by itself"
             yield Finding(WARNING, subject, health.warning, advice)
         elif health.warning:
             yield Finding(ERROR, subject, health.warning, "see its log")
@@ -241,12 +239,6 @@ def _troubles(watch: RigWatch) -> Iterator[Finding]:
             yield Finding(WARNING, subject, text, "the machine is short of time")
         if health.restarts:
             yield Finding(WARNING, subject, f"started again {health.restarts}x", "see its log")
-
-
-def _awaited(health: Health) -> str:
-    """The process without which this one cannot go on; empty when it can."""
-    _, _, process = health.warning.partition(WAITS_FOR)
-    return process
 
 
 def _clocks(watch: RigWatch) -> Iterator[Finding]:

@@ -48,6 +48,8 @@ class Health:
     """How often the process died before and was started again."""
     ready: bool = True
     """False while it still begins, or waits for what it needs to begin."""
+    awaits: str = ""
+    """Without what it cannot go on: another process, or its camera; empty when it can."""
 
 
 @dataclass(frozen=True)

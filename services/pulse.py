@@ -51,13 +51,13 @@ class Pulse:
             self._beats[name] = _Beat(health, now)
             return
         if not health.ready:
-            self._beats[name] = _Beat(health, now, 0 if health.warning else last.still + 1)
+            self._beats[name] = _Beat(health, now, 0 if health.awaits else last.still + 1)
             return
         moved = _progress(health) != _progress(last.health)
         for other, feed in _FEEDS.items():
             if moved and feed == name and other in self._beats and self._beats[other].health.ready:
                 self._beats[other].still += 1
-        waits = name in _FEEDS or health.warning or not health.stamp or not health.stamp.period_ns
+        waits = name in _FEEDS or health.awaits or not health.stamp or not health.stamp.period_ns
         still = 0 if moved else last.still + (not waits)
         self._beats[name] = _Beat(health, now, still)
 

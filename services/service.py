@@ -42,9 +42,6 @@ _SHARING = 8
 """Who died more often sends without shared memory. Whoever has read from it keeps that of each process
 that is dead by now, some 40 MB at 640x480 (eclipse-zenoh/zenoh, issue 2787)."""
 
-WAITS_FOR = "waits for the "
-"""Begins the warning of a process that cannot go on without another, which it names."""
-
 log = logging.getLogger("suturetrack")
 
 
@@ -92,6 +89,8 @@ class Service:
         self.recorder: Recorder | None = None
         self.warning = ""
         """What is wrong at present, for the health; empty when nothing is."""
+        self.awaits = ""
+        """Without what it cannot go on at present, for the health; empty when it can."""
         self._ready = False
         self._unrecorded: deque[Health] = deque(maxlen=8)
         self._complaints: deque[str] = deque(maxlen=8)
@@ -110,9 +109,9 @@ class Service:
     @contextmanager
     def waiting(self, process: str) -> Iterator[None]:
         """Says in the health which process this one waits for, so that nobody takes it for hung."""
-        self.warning = WAITS_FOR + process
+        self.awaits = process
         yield
-        self.warning = ""
+        self.awaits = ""
 
     def record(self, rig: StereoRig, config: object) -> Recorder:
         """Opens the recording; it is closed with the service."""
@@ -151,6 +150,7 @@ class Service:
     def health(self) -> Health:
         """The heartbeat as of now; begins a new window of its figures."""
         window, whole = self.meter.window(), self.meter.whole()
+        waits = self.awaits and f"waits for the {self.awaits}"
         return Health(
             process=self.name,
             time_ns=time.time_ns(),
@@ -163,9 +163,10 @@ class Service:
             dropped=self.bus.dropped + self.meter.skipped,
             refused=self.bus.refused,
             memory_mb=psutil.Process().memory_info().rss / 1e6,
-            warning=self.warning or (self.recorder and self.recorder.problem) or "",
+            warning=self.warning or waits or (self.recorder and self.recorder.problem) or "",
             restarts=self.config.resume,
             ready=self._ready,
+            awaits=self.awaits,
         )
 
     def __enter__(self) -> Self:

@@ -148,10 +148,13 @@ class _Pace:
         """The frame with that number, whenever a stalled camera gives it; None at the end."""
         while not self._service.bus.stop.is_set:
             try:
-                return self._footage.read(index)
+                exposure = self._footage.read(index)
             except Stalled as stall:
-                self._service.warning = str(stall)
+                self._service.awaits, self._service.warning = "camera", str(stall)
                 self._service.complain(str(stall))
+            else:
+                self._service.awaits = ""
+                return exposure
         return None
 
     def _skip(self) -> None:

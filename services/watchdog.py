@@ -23,7 +23,7 @@ class Watchdog:
     def feed(self, health: Health, *, work_waits: bool) -> None:
         """To be called with every heartbeat, and whether there are messages that the loop has not taken."""
         progress = (health.frames, health.refused, health.ready)
-        idle = bool(health.warning) or (health.ready and not work_waits)
+        idle = bool(health.awaits) or (health.ready and not work_waits)
         self._still = 0 if idle or progress != self._progress else self._still + 1
         self._progress = progress
         if self._still <= longest_still(health):

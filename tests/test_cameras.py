@@ -170,13 +170,13 @@ def test_the_source_says_that_its_camera_stalls_and_goes_on(
     thread.start()
     assert frames.get(20) is not None
     devices.stalled.set()
-    wait_until(lambda: service.health().warning)
+    wait_until(lambda: service.health().awaits == "camera")
     assert service.health().warning.startswith("camera 0: no image for ")
     while frames.get(0) is not None:
         pass
     devices.stalled.clear()
     assert frames.get(20) is not None
-    wait_until(lambda: not service.health().warning)
+    wait_until(lambda: not service.health().warning and not service.health().awaits)
     devices.stalled.set()
     wait_until(lambda: service.health().warning)
     service.bus.stop.set()

@@ -19,7 +19,6 @@ from services.bus import Bus
 from services.doctor import ERROR, OK, WARNING, DoctorConfig, certificates, examine, listening
 from services.keys import KeysConfig, init
 from services.messages import Health, Latency
-from services.service import WAITS_FOR
 from services.status import StatusConfig, run, watch_rigs
 from services.zenoh_transport import ZenohTransport, local_config, local_rigs
 from suturetrack.types import Energies, InputError, Stamp, Status, ThreadState
@@ -95,13 +94,13 @@ def test_troubles_of_a_running_system_are_named(rig: Bus) -> None:
 
 def test_a_process_that_waits_is_no_trouble_of_its_own(rig: Bus) -> None:
     waits = replace(HEALTHY, frames=0, rate_hz=0.0)
-    alone = replace(waits, process="tracker", warning=f"{WAITS_FOR}source")
+    alone = replace(waits, process="tracker", warning="waits for the source", awaits="source")
     say(rig, alone)
     advice = {f.subject: f for f in examine(DoctorConfig(rig.rig))}
     found = advice[f"{rig.rig}: tracker"]
     assert (found.level, found.text) == (WARNING, "waits for the source")
     assert found.advice == "start the source, as above; this process then goes on by itself"
-    unready = replace(waits, process="segmenter", warning=f"{WAITS_FOR}tracker")
+    unready = replace(waits, process="segmenter", warning="waits for the tracker", awaits="tracker")
     say(rig, waits, unready, replace(waits, process="tracker"))
     advice = {f.subject: f for f in examine(DoctorConfig(rig.rig))}
     found = advice[f"{rig.rig}: segmenter"]

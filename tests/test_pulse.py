@@ -12,15 +12,15 @@ FEEDS = ("source", "segmenter", "tracker")
 
 
 def beat(
-    process: str, frames: int, restarts: int = 0, warning: str = "", period_ns: int = 33_333_333
+    process: str, frames: int, restarts: int = 0, awaits: str = "", period_ns: int = 33_333_333
 ) -> Health:
     stamp = Stamp(frames, frames, frames, period_ns) if frames else None
     figures = (1.0, Latency(), 1.0, Latency())
-    return Health(process, 1, stamp, *figures, frames, 0, 0, 1.0, warning, restarts)
+    return Health(process, 1, stamp, *figures, frames, 0, 0, 1.0, "", restarts, awaits=awaits)
 
 
-def unready(process: str, restarts: int = 0, warning: str = "") -> Health:
-    return replace(beat(process, 0, restarts, warning), ready=False)
+def unready(process: str, restarts: int = 0, awaits: str = "") -> Health:
+    return replace(beat(process, 0, restarts, awaits), ready=False)
 
 
 class Run:
@@ -73,8 +73,10 @@ def test_a_process_that_was_never_heard_of_is_noticed_after_ten_seconds() -> Non
 def test_a_process_that_never_gets_ready_is_noticed_unless_it_waits_for_another() -> None:
     run = Run()
     for second in range(1, 400):
-        waits = unready("tracker", warning="waits for the source" if second < 200 else "")
-        run.pass_second(unready("source", warning="waits"), beat("segmenter", 30 * second), waits)
+        waits = unready("tracker", awaits="source" if second < 200 else "")
+        run.pass_second(
+            unready("source", awaits="segmenter"), beat("segmenter", 30 * second), waits
+        )
         if second != 380:
             assert set(run.troubles()) == ({"tracker"} if second > 380 else set()), second
     assert "not ready after" in run.troubles()["tracker"]
@@ -95,11 +97,22 @@ def test_a_loop_that_stands_still_is_noticed_though_its_heart_beats() -> None:
         assert "finished no frame for" in run.troubles()[stuck]
 
 
+def test_what_is_wrong_beside_the_work_hides_no_hang() -> None:
+    run = Run()
+    for second in range(1, 15):
+        beats = {name: beat(name, 30 * second) for name in FEEDS}
+        beats["tracker"] = replace(
+            beat("tracker", 60), warning="recording stopped: the disk is full"
+        )
+        run.pass_second(*beats.values())
+    assert set(run.troubles()) == {"tracker"}
+
+
 def test_nobody_is_blamed_for_a_stalled_camera_or_lock_step_or_a_slow_source() -> None:
-    for warning, period_ns in (("no frame for 3 s", 33_333_333), ("", 0), ("", 20_000_000_000)):
+    for awaits, period_ns in (("camera", 33_333_333), ("", 0), ("", 20_000_000_000)):
         run = Run()
         for _ in range(30):
-            run.pass_second(*(beat(name, 7, 0, warning, period_ns) for name in FEEDS))
+            run.pass_second(*(beat(name, 7, 0, awaits, period_ns) for name in FEEDS))
             assert run.troubles() == {}
 
 

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -49,12 +50,13 @@ def test_a_process_that_finishes_frames_or_has_nothing_to_do_is_fed_for(systemd:
     for _ in range(30):
         assert systemd.is_told(dog, beat("tracker", 900), work_waits=False)
     for _ in range(30):
-        assert systemd.is_told(dog, beat("source", 900, warning="no frame for 9 s"))
+        assert systemd.is_told(dog, beat("source", 900, awaits="camera"))
 
 
 def test_a_process_that_finishes_nothing_while_frames_wait_is_not(systemd: Systemd) -> None:
     dog = Watchdog()
-    told = [systemd.is_told(dog, beat("tracker", 900)) for _ in range(30)]
+    stuck = replace(beat("tracker", 900), warning="recording stopped: the disk is full")
+    told = [systemd.is_told(dog, stuck) for _ in range(30)]
     assert told == 11 * [True] + 19 * [False]
     assert systemd.is_told(dog, beat("tracker", 901))
 
@@ -69,7 +71,7 @@ def test_a_slow_rate_is_no_hang(systemd: Systemd) -> None:
 def test_a_beginning_may_take_longer_but_not_for_ever(systemd: Systemd) -> None:
     dog = Watchdog()
     for _ in range(300):
-        assert systemd.is_told(dog, unready("tracker", warning="waits for the source"))
+        assert systemd.is_told(dog, unready("tracker", awaits="source"))
     told = [systemd.is_told(dog, unready("tracker")) for _ in range(300)]
     assert told == 180 * [True] + 120 * [False]
 
