@@ -285,6 +285,29 @@ def test_a_plain_look_takes_the_place_of_a_hopeless_one_at_once(
     assert max(rms(state, pair(i)[1]) for i, state in enumerate(states) if i >= sure) < 0.25
 
 
+def test_what_was_never_sure_does_not_tell_the_length(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def look(field: RidgeField, *more: object) -> Initialization:
+        found = initialize(field, *more)  # type: ignore[arg-type]
+        if field.stamp.frame:
+            return found
+        return replace(found, curve=nurbs.part(found.curve, 0.0, 0.6), confidence=0.1)
+
+    looks_by(monkeypatch, look)
+    truths, away = [thread(i / FPS) for i in range(FPS)], range(3, 14)
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, truths[0]))
+    states = [
+        tracker.step(paint(rig, [] if i in away else [points], i)).states[0]
+        for i, points in enumerate(truths)
+    ]
+    assert states[0].length < 0.7 * metrics.polyline_length(truths[0])
+    assert states[away[-1]].status is Status.LOST
+    assert states[-1].status is Status.TRACKING
+    assert rms(states[-1], truths[-1]) < 0.15
+
+
 def test_a_curve_that_lacks_an_end_is_what_a_look_finds(rig: StereoRig) -> None:
     field = paint(rig, [thread(0.0)], 0)
     whole = initialize(field, rig, seed_on(rig, thread(0.0))).curve

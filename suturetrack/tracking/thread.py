@@ -159,8 +159,11 @@ class Thread:
         turn = self._failures - 1 if is_beside else None
         follower = copy.copy(self.follower)
         if follower is not None:
-            last, lengths, rig = follower.last_good, follower.known_lengths, follower.rig
-            return Again(self._seed, self._setup, last, lengths, rig, follower, turn)
+            last, rig = follower.last_good, follower.rig
+            # What was never sure to be the thread does not tell its length.
+            before = follower if self._was_sure else None
+            lengths = follower.known_lengths if self._was_sure else ()
+            return Again(self._seed, self._setup, last, lengths, rig, before, turn)
         assert self._state.curve is not None
         known = (self._state.length,) if self._failures <= _QUICK_ATTEMPTS else ()
         return Again(self._seed, self._setup, self._state.curve, known, self._setup.rig, None, turn)
