@@ -1,4 +1,7 @@
-"""What the tracker holds shows the segmenter, once a second, how the threads look by now."""
+"""What the tracker holds shows the segmenter, once a second, how the threads look by now.
+
+A thread that is lost may have faded: it is looked for as if it stood out less and less.
+"""
 
 from __future__ import annotations
 
@@ -60,6 +63,8 @@ class Adaptation:
                 shown = np.linspace(0, 1, len(state.seen))[state.seen]
                 pixels = self._rig.project_raw(nurbs.evaluate(state.curve, shown))[0]
                 self._segmenter.adapt(sample, pixels, thread)
+            elif state.status is Status.LOST and state.curve is not None:
+                self._segmenter.fade(thread)
 
     def _of(self, frame: StereoFrame) -> dict[str, ThreadState]:
         return {state.thread: state for state in self._arrived if state.stamp == frame.stamp}

@@ -12,7 +12,7 @@ and white balance, and in the other camera.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -49,6 +49,8 @@ _WINDOWS, _HALF_PX = 10, 32
 # Least cosine between two looks at one thread: 0.88 and more on one ground, elsewhere any; other
 # colours give up to 0.64.
 _ALIKE = 0.5
+# What a thread that is lost keeps of the contrast with which it was seen last.
+_FAINTEST = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +66,11 @@ class Contrast:
     """(3, 3) covariance of the second derivatives around the thread."""
     sigma: float
     """Scale that suits the thread's width, px."""
+
+    @property
+    def strength(self) -> float:
+        """Length of `across`."""
+        return float(np.linalg.norm(self.across))
 
     def stands_out(self, weights: Float64) -> float:
         """By how many deviations of the clutter the thread is darker in a mix."""
@@ -88,6 +95,11 @@ class Contrast:
             )
         )
         return Contrast(weights / np.abs(weights).sum(), across, clutter, self.sigma)
+
+    def fainter(self, share: float, clear: Contrast) -> Contrast:
+        """As if it stood out by a `share` only, or by a quarter of what was `clear`, if that is more."""
+        least = min(_FAINTEST * clear.strength / self.strength, 1.0)
+        return replace(self, across=max(share, least) * self.across)
 
 
 def channel_means(image: Image) -> Float64:

@@ -40,6 +40,8 @@ _HUES = (2 * np.arange(256) % 180).astype(np.uint8)
 _SLOTS = 4
 # Share of the way that the automatic c, and a learned contrast, go at each step.
 _PULL, _ADAPT = 0.1, 0.2
+# What is left at each step of the contrast of a thread that stays lost.
+_FADE = 0.5
 # Fewest pixels of a curve from which contrast is learned.
 _FEWEST_PIXELS = 8
 # Worth of a mix in which some threads are dark and others bright, so that both must be looked for.
@@ -92,6 +94,8 @@ class Segmenter:
         self._rig = rig
         self._config = config
         self._threads: dict[str, Contrast] = {}
+        self._clear: dict[str, Contrast] = {}
+        """As they were when they were seen last."""
         self._look = _first_look(config)
         width, height = rig.image_size
         self._views = _View(height, width, config), _View(height, width, config)
@@ -142,12 +146,13 @@ class Segmenter:
         if contrast is not None:
             if self._is_cut_out:
                 contrast = replace(contrast, sigma=max(silhouette_scale(frame.left), SIGMAS[0]))
-            self._threads[seed.thread] = contrast
+            self._threads[seed.thread] = self._clear[seed.thread] = contrast
             self._relook()
 
     def forget(self, thread: str) -> None:
         """Look for a thread no more; without any, look as before the first was learned."""
         if self._threads.pop(thread, None) is not None:
+            del self._clear[thread]
             self._is_cut_out &= bool(self._threads)
             self._relook()
 
@@ -170,9 +175,24 @@ class Segmenter:
         learned = self._config.adapt and thread in self._threads
         if not learned or np.count_nonzero(inside) < _FEWEST_PIXELS:
             return
-        old = self._threads[thread]
+        old, clear = self._threads[thread], self._clear[thread]
         seen = contrast_along(frame.left, pixels[inside], old.sigma)
-        self._threads[thread] = old.follow(seen, _ADAPT)
+        # What was lost may be as clear as before, or as faint as it was found again.
+        nearer = min(old, clear, key=lambda contrast: abs(contrast.strength - seen.strength))
+        followed = nearer.follow(seen, _ADAPT)
+        if followed is not nearer:
+            self._threads[thread] = self._clear[thread] = followed
+            self._relook()
+
+    def fade(self, thread: str = "0") -> None:
+        """Look for a thread that is lost as if it stood out less than before, down to a quarter of what
+        it did when it was seen last.
+
+        Focus, smoke or light may have changed at once, when no curve is held that could show it.
+        """
+        if not self._config.adapt or thread not in self._threads:
+            return
+        self._threads[thread] = self._threads[thread].fainter(_FADE, self._clear[thread])
         self._relook()
 
     def warm_up(self) -> None:

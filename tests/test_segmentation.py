@@ -520,6 +520,41 @@ def test_the_contrast_follows_the_surroundings(thread: str) -> None:
     assert np.abs(np.diff(steps)).max() < 0.1
 
 
+def test_a_thread_that_fades_at_once_is_seen_again(scene: Scene) -> None:
+    """Fog comes and goes; the thread is lost in it at first."""
+    clear, pixels = scene.render(0), thread_pixels(scene)
+    fog = StereoFrame(STAMP, *(np.uint8(0.25 * image + 130) for image in clear))
+    frame, segmenter = StereoFrame(STAMP, *clear), Segmenter(scene.rig)
+    segmenter.learn(frame, Seed(pixel=scene.seed_pixel()))
+
+    def seen(frame: StereoFrame) -> float:
+        return float(np.median(on_thread(segmenter.step(frame).left, pixels)))
+
+    before, in_fog = seen(frame), seen(fog)
+    for _ in range(5):
+        segmenter.fade()
+    found = seen(fog)
+    segmenter.adapt(fog, pixels[10:-10:10])
+    held = seen(fog)
+    assert in_fog < 0.2 * before
+    assert found > 3 * in_fog
+    assert held > 0.8 * found
+    assert before > 0.3
+
+
+def test_a_thread_that_was_only_hidden_is_looked_for_as_before(scene: Scene) -> None:
+    frame, pixels = StereoFrame(STAMP, *scene.render(0)), thread_pixels(scene)[10:-10:10]
+    lost, held = Segmenter(scene.rig), Segmenter(scene.rig)
+    for segmenter in (lost, held):
+        segmenter.learn(frame, Seed(pixel=scene.seed_pixel()))
+    for _ in range(5):
+        lost.fade()
+    assert not np.array_equal(lost.step(frame).left, held.step(frame).left)
+    for segmenter in (lost, held):
+        segmenter.adapt(frame, pixels)
+    np.testing.assert_array_equal(lost.step(frame).left, held.step(frame).left)
+
+
 def test_a_curve_beside_the_thread_teaches_nothing(scene: Scene) -> None:
     frame, pixels = StereoFrame(STAMP, *scene.render(0)), thread_pixels(scene)[10:-10:10]
     led, left_alone = Segmenter(scene.rig), Segmenter(scene.rig)
