@@ -1,6 +1,6 @@
 """What the tracker holds shows the segmenter, once a second, how the threads look by now.
 
-A thread that is lost may have faded: it is looked for as if it stood out less and less.
+Where all of them are lost they may have faded: they are looked for as if they stood out less and less.
 """
 
 from __future__ import annotations
@@ -57,13 +57,15 @@ class Adaptation:
             if state is None:
                 break
             self._arrived.append(state)
-        for thread, message in sorted(self._of(sample).items()):
+        states = self._of(sample)
+        all_lost = all(state.status is Status.LOST for state in states.values())
+        for thread, message in sorted(states.items()):
             state = scaled(message, 1 / self._rig.metres_per_unit)
             if state.status is Status.TRACKING and state.curve is not None:
                 shown = np.linspace(0, 1, len(state.seen))[state.seen]
                 pixels = self._rig.project_raw(nurbs.evaluate(state.curve, shown))[0]
                 self._segmenter.adapt(sample, pixels, thread)
-            elif state.status is Status.LOST and state.curve is not None:
+            elif all_lost and state.curve is not None:
                 self._segmenter.fade(thread)
 
     def _of(self, frame: StereoFrame) -> dict[str, ThreadState]:

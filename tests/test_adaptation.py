@@ -95,6 +95,16 @@ def test_a_curve_that_is_not_sure_teaches_nothing(scenes: tuple[Scene, Scene]) -
     assert len(set(desk.fields)) == 1
 
 
+def test_a_lost_thread_beside_one_that_is_held_changes_nothing(
+    scenes: tuple[Scene, Scene],
+) -> None:
+    desk = Desk(scenes)
+    for index in range(7):
+        lost = state_of(desk.curve, Stamp(index, 0, 0), Status.LOST)
+        desk.frame(index, lost, replace(lost, thread="1", status=Status.OCCLUDED))
+    assert len(set(desk.fields)) == 1
+
+
 def test_a_thread_that_is_lost_is_looked_for_as_if_it_stood_out_less(
     scenes: tuple[Scene, Scene],
 ) -> None:
