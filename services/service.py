@@ -39,8 +39,8 @@ _GRACE_S = 1.2
 """From the wish to stop until a step that takes too long is interrupted."""
 _COMPLAINT_INTERVAL_S = 1.0
 _SHARING = 8
-"""Who died more often sends without shared memory. Whoever has read from it keeps that of each process
-that is dead by now, some 40 MB at 640x480 (eclipse-zenoh/zenoh, issue 2787)."""
+"""Who died so often sends without shared memory: its readers keep that of everyone who died, up to 40 MB
+each at 640x480, until they end themselves (eclipse-zenoh/zenoh, issue 2787)."""
 
 log = logging.getLogger("suturetrack")
 
