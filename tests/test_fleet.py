@@ -13,7 +13,7 @@ def test_a_run_whose_process_died_for_good_does_not_end_well() -> None:
     said: list[str] = []
     fleet = Fleet(launches, said.append, 5, Pulse())
     try:
-        wait_until(lambda: not fleet.tend(), 120)
+        wait_until(lambda: not fleet.tend() and any("is started again" in s for s in said), 120)
     finally:
         fleet.stop()
     complaint = fleet.complaint()
