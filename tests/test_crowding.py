@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
@@ -30,6 +31,18 @@ def flags(
     points = points[::4]
     both = views(rig, points, np.gradient(points, axis=0) * len(points))
     return crowded(both, np.full(len(points), 1 / len(points)), field, LEVELS, others)
+
+
+def hook(radius: float, lift: float) -> np.ndarray:
+    """(n, 3) points of a thread that turns back and crosses itself with its last stretch."""
+    angle, t = np.linspace(-np.pi / 2, np.pi / 2, 120), np.linspace(0, 1, 300)
+    out = np.c_[np.linspace(-30, 15, 240), np.zeros(240)]
+    turn = radius * np.c_[np.cos(angle), 1 + np.sin(angle)] + [15, 0]
+    back = np.c_[15 - 44 * t, 2 * radius - (2 * radius - lift) * t**2]
+    flat = np.concatenate([out, turn[1:], back[1:]]) + np.array([5, -6])
+    travelled = np.r_[0, np.cumsum(np.linalg.norm(np.diff(flat, axis=0), axis=1))]
+    at = np.arange(0, 44 + np.pi * radius + 44, 0.25)
+    return np.c_[[np.interp(at, travelled, c) for c in flat.T]].T @ np.eye(2, 3) + [0, 0, 200]
 
 
 def test_a_thread_on_its_own_is_alone(rig: StereoRig) -> None:
@@ -76,3 +89,32 @@ def test_an_arc_does_not_slip_onto_the_line_that_cuts_it(rig: StereoRig) -> None
             held += 1
             assert off.p95 < 1.0
     assert held > 50
+
+
+def test_a_tip_beside_its_own_thread_crowds_it_and_a_loop_does_not(rig: StereoRig) -> None:
+    thread = hook(3.0, -1.0)
+    found = flags(rig, paint(rig, [thread], 0), thread)
+    away = rig.focal / 200.0 * np.abs(thread[::4, 1] - thread[0, 1])
+    tip = np.flatnonzero((away > 4.5) & (np.arange(len(away)) > len(away) / 2))[-1]
+    assert found[tip + 3 :].all()
+    assert not found[:tip].any()
+
+
+@pytest.mark.parametrize(("radius", "depth"), [(6.0, 4.0), (4.0, 6.0), (3.0, 4.0)])
+def test_a_tip_that_crosses_its_own_thread_at_a_shallow_angle_is_held(
+    rig: StereoRig, radius: float, depth: float
+) -> None:
+    tracker, apart, held = Tracker(rig), [], 0
+    for i in range(150):
+        truth = hook(radius, 4.0 - 2 * depth * np.sin(np.pi * i / 150) ** 2)
+        field = paint(rig, [truth], i)
+        if i == 0:
+            u, v = rig.project_raw(truth[60])[0]
+            tracker.seed(Seed("0", pixel=(float(u), float(v))))
+        state = tracker.step(field).states[0]
+        assert state.curve is not None
+        ends = nurbs.evaluate(state.curve, np.array([0.0, 1.0]))
+        apart.append(np.linalg.norm(ends - truth[-1], axis=1).min())
+        held += state.status is Status.TRACKING
+    assert max(apart) < 1.2
+    assert held > 140

@@ -26,7 +26,8 @@ def crowded(
 ) -> Bool:
     """(k,) samples beside which another thread or an unknown ridge runs, in either image.
 
-    The thread's own strands do not count: in a knot they are all there is to go by.
+    The thread's own strands do not count, for in a knot they are all there is to go by; but those do
+    that run beside its ends.
 
     Args:
         both: the samples as predicted, left and right.
@@ -45,11 +46,17 @@ def _beside(image: Float32, view: View, share: Float64, level: float, others: St
     own, lengths = Strand.of(view, share), view.speed * share
     known = search.doubled(own.arrays, others.arrays, SAME_STRAND_PX, _NEAR_PX)
     itself = search.doubled(own.arrays, own.arrays, SAME_STRAND_PX, _GRID_PX[-1])
+    touching = search.doubled(own.arrays, own.arrays, SAME_STRAND_PX, _NEAR_PX)
     profiles = search.normal_profiles(image, view.pixels, view.tangents, _GRID_PX, 0.0)
     inner = profiles[:, 1:-1]
     summits = (inner > profiles[:, :-2]) & (inner >= profiles[:, 2:]) & (inner > _CLEAR * level)
     several = search.solid((summits.sum(axis=1) > 1) & ~itself, lengths, _SHORTEST_PX)
-    return known | several
+    return known | several | _from_the_ends(touching)
+
+
+def _from_the_ends(flags: Bool) -> Bool:
+    """The flags that are set from either end on."""
+    return np.logical_and.accumulate(flags) | np.logical_and.accumulate(flags[::-1])[::-1]
 
 
 def _closed(flags: Bool, lengths: Float64) -> Bool:

@@ -298,11 +298,17 @@ class Follower:
         model.curve = best.fit.curve
         if best.share > 0.3:
             self._adjust_ends(field, best.fit.crowded)
-        start, stop = doubled_ends(model.curve, self.rig)
-        if start or stop:
-            model.curve = nurbs.part(model.curve, start, 1.0 - stop)
+        self._cut_doubled_ends()
         model.curve, inserted, removed = rearrange(model.curve, self.rig)
         return best, inserted, removed
+
+    def _cut_doubled_ends(self) -> None:
+        """Cuts off what has folded, where the curve is too long: a tip may lie on its own thread."""
+        model = self.model
+        spare = 1.0 - model.ends.length / length_of(model.curve)
+        if spare > 0:
+            start, stop = (min(part, spare) for part in doubled_ends(model.curve, self.rig))
+            model.curve = nurbs.part(model.curve, start, 1.0 - stop)
 
     def _search(self, predicted: Nurbs, field: RidgeField, neighbours: Neighbours) -> Evidence:
         """Looks further away for what was seen before, and now and then for what is hidden."""
