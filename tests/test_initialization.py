@@ -241,6 +241,51 @@ def test_a_crossing_that_neither_view_can_tell_is_doubtful() -> None:
     assert is_right or any("an ambiguous crossing" in reason for reason in found.reasons)
 
 
+def look_at(strands: list[Float64], seed: Float64, rig: StereoRig) -> Initialization:
+    """The thread through a seed (2,), among strands at one depth."""
+    left, right = None, None
+    for strand in strands:
+        left, right = draw(strand, rig, left), draw(strand - [110, 0], rig, right)
+    assert left is not None
+    assert right is not None
+    u, v = seed
+    return initialize(field_of(left, right, rig), rig, Seed(pixel=(float(u), float(v))))
+
+
+@pytest.mark.parametrize("is_joined", [True, False])
+def test_a_thread_that_may_have_run_into_another_one_is_doubtful(
+    rig: StereoRig, is_joined: bool
+) -> None:
+    """Two come, and one goes on: the one that does so more smoothly need not be the one."""
+    t = np.linspace(0, 1, 500)
+    straight = np.c_[np.full(500, 330.0), 255 - 190 * t]
+    aside = np.c_[330 + 80 * t**1.5, 250 - 150 * t]
+    on = np.c_[np.full(500, 330.0), 250 + 170 * t]
+    strands = [np.r_[aside[::-1], on], straight] if is_joined else [np.r_[straight[::-1], on]]
+    found = look_at(strands, straight[370], rig)
+    assert (found.confidence < 0.5) == is_joined
+    assert any("another strand that ends on it" in why for why in found.reasons) == is_joined
+
+
+@pytest.mark.parametrize("is_bent", [True, False])
+def test_a_thread_that_may_end_where_another_one_begins_is_doubtful(
+    rig: StereoRig, is_bent: bool
+) -> None:
+    """A gap in a bend is bridged without doubt, but not one between strands that do not bend."""
+    t = np.linspace(0, 1, 500)
+    come = np.c_[np.full(500, 330.0), 250 - 180 * t]
+    turn = 1.7 * t[12:]
+    if is_bent:
+        go = [330.0, 255.0] + 170 * np.c_[np.sin(np.pi / 3) * t, np.cos(np.pi / 3) * t]
+    else:
+        go = [330.0, 250.0] + 140 * np.c_[1 - np.cos(turn), np.sin(turn)]
+    found = look_at([come, go], come[370], rig)
+    ends = rig.project(dense(found.curve))[0][[0, -1]]
+    assert np.linalg.norm(ends - go[-1], axis=1).min() < 5
+    assert (found.confidence < 0.5) == is_bent
+    assert any("a bend as of two strands" in why for why in found.reasons) == is_bent
+
+
 @pytest.mark.parametrize(("gap", "is_doubtful"), [(5.0, False), (1.0, True)])
 def test_an_end_that_is_seen_to_stop_short_of_the_thread_is_not_doubtful(
     rig: StereoRig, gap: float, is_doubtful: bool

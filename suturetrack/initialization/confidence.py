@@ -8,17 +8,14 @@ from scipy.spatial import cKDTree
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
+from suturetrack.initialization.doubts import CROSSING, FOREIGN, Doubt
 from suturetrack.initialization.fitting import Samples
 from suturetrack.initialization.growth import Chain
 from suturetrack.initialization.segments import Ridges
-from suturetrack.initialization.topology import CROSSING
 from suturetrack.metrics import coverage, polyline_length
 from suturetrack.types import Float64, Nurbs
 
 Int64 = NDArray[np.int64]
-Doubt = tuple[Float64, str, float]
-"""A pixel (2,), what is doubtful there, and the confidence that this leaves."""
-
 _AGREED = 0.95
 """Share of the thread from which both views are said to agree."""
 _NEAR_PX = 3.0
@@ -79,6 +76,7 @@ def judge(
         reasons.append(f"uncertain depth: even its best parts to {vague:.1%} of the length only")
     confidence /= 1 + (vague / _VAGUE) ** 6
     doubts = [_settled(_distinct(c), p, r) for c, p, r in zip(chains, pixels, ridges, strict=True)]
+    doubts = [_confirmed(view, doubts, pixels) for view in (0, 1)]
     for view, name in enumerate(("left", "right")):
         reasons += [
             f"{why} in the {name} view at ({scale * u:.0f}, {scale * v:.0f})"
@@ -99,8 +97,9 @@ _ORDINAL = ("first", "last")
 
 
 def clarity(chain: Chain, places: Float64) -> float:
-    """What the doubts about a chain near (k, 2) places leave of the confidence in it."""
-    return float(np.prod([rest for where, _, rest in _distinct(chain) if _is_near(where, places)]))
+    """What the doubts of one view about a chain near (k, 2) places leave of the confidence in it."""
+    doubts = [(where, rest) for where, why, rest in _distinct(chain) if why not in FOREIGN]
+    return float(np.prod([rest for where, rest in doubts if _is_near(where, places)]))
 
 
 def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
@@ -111,6 +110,9 @@ def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
     """
     kept = []
     for place, why, rest in doubts:
+        if why in FOREIGN:
+            kept.append((place, why, rest))
+            continue
         near = np.flatnonzero(np.linalg.norm(line - place, axis=1) <= _SAME_PLACE_PX)
         if not _is_one_pass(line, near) or not _is_all_ridge(place, line, near, ridges):
             kept.append((place, why, rest))
@@ -134,15 +136,31 @@ def _remaining(
     left = 1.0
     for place, why, rest in doubts[view]:
         there = counterpart[np.argmin(np.linalg.norm(line - place, axis=1))]
-        same = [d[2] for d in doubts[1 - view] if d[1] == why and _is_near(there, d[0][None])]
-        both = max(rest, min(same, default=1.0))
+        both = max(rest, min(_same(why, there, doubts[1 - view]), default=1.0))
         if not _is_shared(place, line, counterpart, chains[1 - view].pixels):
             left *= rest
-        elif why == CROSSING and both < _GRAVE:
+        elif why in (CROSSING, *FOREIGN) and both < _GRAVE:
             left *= both
         else:
             left *= np.sqrt(rest)
     return left
+
+
+def _confirmed(view: int, doubts: list[list[Doubt]], lines: tuple[Float64, Float64]) -> list[Doubt]:
+    """The doubts of a view, and whether a part is another thread's only where the other view doubts it
+    as well: strands meet, or draw each other aside, in one view alone."""
+    kept = []
+    for place, why, rest in doubts[view]:
+        there = lines[1 - view][np.argmin(np.linalg.norm(lines[view] - place, axis=1))]
+        if why not in FOREIGN or _same(why, there, doubts[1 - view]):
+            kept.append((place, why, rest))
+    return kept
+
+
+def _same(why: str, place: Float64, doubts: list[Doubt]) -> list[float]:
+    """What doubts of a kind near a place of their view leave of the confidence."""
+    kinds = FOREIGN if why in FOREIGN else (why,)
+    return [rest for where, kind, rest in doubts if kind in kinds and _is_near(where, place[None])]
 
 
 def _is_shared(place: Float64, line: Float64, counterpart: Float64, chain: Float64) -> bool:
@@ -184,10 +202,11 @@ def _is_near(where: Float64, places: Float64) -> bool:
 
 
 def _distinct(chain: Chain) -> list[Doubt]:
-    """The doubts, the gravest first, one for each place."""
+    """The doubts, the gravest first, one for each place beside those about other threads there."""
     kept: list[Doubt] = []
     for doubt in sorted(chain.doubts, key=lambda d: d[2]):
-        if all(np.linalg.norm(doubt[0] - other[0]) > _SAME_PLACE_PX for other in kept):
+        alike = [d for d in kept if (d[1] in FOREIGN) == (doubt[1] in FOREIGN)]
+        if all(np.linalg.norm(doubt[0] - other[0]) > _SAME_PLACE_PX for other in alike):
             kept.append(doubt)
     return kept
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from suturetrack.initialization.depth import Depth
+from suturetrack.initialization.doubts import Doubt, doubts
 from suturetrack.initialization.model import InitializationConfig, ViewGrowth
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import follow, merge_ends
@@ -37,8 +38,8 @@ class Chain:
     """(k, 2) about one pixel apart."""
     seen: Bool
     """(k,) False where a gap was bridged."""
-    doubts: tuple[tuple[Float64, str, float], ...] = ()
-    """Pixels (2,) where the thread may run another way, why, and the confidence that this leaves."""
+    doubts: tuple[Doubt, ...] = ()
+    """Where the thread may run another way."""
 
 
 def nearest_segment(ridges: Ridges, seed: Float64, reach: float) -> tuple[int | None, Float64]:
@@ -91,12 +92,8 @@ def follow_thread(
     merged = merge_ends(ridges, config, depth)
     ridges = replace(ridges, segments=merged.segments)
     entries = _without_faint_ends(ridges, follow(origin, merged.partner), origin)
-    doubts = tuple(
-        (ridges.segments[e // 2][-(e % 2)], why, rest)
-        for e, why, rest in merged.doubts(entries, ridges)
-    )
     pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
-    chain = replace(_join(pieces), doubts=doubts)
+    chain = replace(_join(pieces), doubts=tuple(doubts(merged, entries, ridges)))
     return Thread(ridges, entries, origin, chain)
 
 
@@ -111,10 +108,10 @@ def without_faint_tails(thread: Thread, place: Float64) -> Thread:
     if stop - start == len(strength):
         return thread
     pixels = chain.pixels[start:stop]
-    doubts = [d for d in chain.doubts if np.linalg.norm(pixels - d[0], axis=1).min() < _WINDOW]
+    left = [d for d in chain.doubts if np.linalg.norm(pixels - d[0], axis=1).min() < _WINDOW]
     cut = [end for end, at in ((0, start), (-1, len(strength) - stop)) if at > 0]
-    doubts += [(pixels[end], "a fainter ridge behind an end", _FAINTER) for end in cut]
-    return replace(thread, chain=Chain(pixels, chain.seen[start:stop], tuple(doubts)))
+    left += [(pixels[end], "a fainter ridge behind an end", _FAINTER) for end in cut]
+    return replace(thread, chain=Chain(pixels, chain.seen[start:stop], tuple(left)))
 
 
 def _falls_at(strength: Float64, first: int) -> int:

@@ -62,6 +62,12 @@ class Strands:
             return None
         return sum(self._misfit(*p) for p in others) - sum(self._misfit(*p) for p in pairs)
 
+    def bend(self, i: int, j: int) -> float:
+        """Energy of the bend between the arms of two ends; 0 where one is too short to tell."""
+        if i // 2 == j // 2 or min(len(self._arm(i)), len(self._arm(j))) < _LEAST_ARM:
+            return 0.0
+        return _bend(self._arm(i), self._arm(j))
+
     def _misfit(self, i: int, j: int) -> float:
         return _BENT * (_bend(self._arm(i), self._arm(j)) + self._step(i, j))
 

@@ -10,27 +10,19 @@ from numpy.typing import NDArray
 
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.model import InitializationConfig
-from suturetrack.initialization.pricing import FREE_END, TOUCHING_PX, Merge, price_merges
-from suturetrack.initialization.segments import ARM, Ridges
+from suturetrack.initialization.pricing import FREE_END, Merge, price_merges
+from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.strands import REACH, Strands
 from suturetrack.types import Float64
 
 Int64 = NDArray[np.int64]
 
-CROSSING = "an ambiguous crossing"
-"""Why a thread is doubtful where it might leave a crossing another way."""
-_REASSURANCE = 0.3
-"""Share of its lead over the next best way that the price of a merge is less doubtful by."""
-_STRAIN = 1.5
-"""How much of the confidence is lost with each unit of doubt that is left of the price."""
-_RUNS_ON = 0.55
-"""Price of a merge below which an end might as well run on."""
-_GAP, _GAP_SAMPLES = 0.85, 13
-"""Least ||V|| between an end and another strand, against both, below which a gap is seen there."""
 _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""
 _CLEARLY = 0.03
 """By how much less two strands have to cost in all if their far parts are swapped."""
+_BENT = 8.0
+"""Energy by which two arms fit together less well as one strand than as two."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,66 +35,12 @@ class Merged:
     """The end that each joined end was joined to."""
     price: dict[tuple[int, int], float]
     """Of every pair of ends within reach."""
+    bent: frozenset[int]
+    """The joined ends whose strands bend there as two would, and not one."""
 
-    def doubts(self, entries: list[int], ridges: Ridges) -> list[tuple[int, str, float]]:
-        """What is doubtful about the thread that enters its segments at `entries`: at which end, why,
-        and what that leaves of the confidence; `ridges` are those that were merged."""
-        within = _within_reach(self.price)
-        found = []
-        for entry in entries[1:]:
-            price = self.price[entry, self.partner[entry]]
-            lead = min(self._lead(entry, entries, within), FREE_END)
-            strain = price - _REASSURANCE * lead
-            if price >= 2 * FREE_END:
-                found.append((entry, "a sharp bend", 0.6))
-            elif strain > 0:
-                rest = max(1 - _STRAIN * strain, 0.1)
-                found.append((entry, CROSSING, rest))
-        for tip in (entries[0], entries[-1] ^ 1):
-            if self._runs_into_another(tip, entries, ridges):
-                on = min((self.price[tip, j] for j in within.get(tip, ())), default=np.inf)
-                rest = 0.25 if on < _RUNS_ON else 0.4
-                found.append((tip, "an end beside another ridge", rest))
-        return found
-
-    def _lead(self, entry: int, entries: list[int], within: dict[int, list[int]]) -> float:
-        """How much more the ends cost in total if another way is taken at `entry`."""
-        other = self.partner[entry]
-        on_thread = {e // 2 for e in entries}
-        added = [
-            _swap(end, rival, self.partner, self.price, within)[0]
-            for end, partner in ((entry, other), (other, entry))
-            for rival in within.get(end, ())
-            if rival != partner and not (self._is_copy(rival, partner) and rival // 2 in on_thread)
-        ]
-        return max(min(added, default=1.0), 0.0)
-
-    def _is_copy(self, one: int, other: int) -> bool:
+    def is_copy(self, one: int, other: int) -> bool:
+        """Whether two ends are the same one of a segment that strands share."""
         return one % 2 == other % 2 and self.segments[one // 2] is self.segments[other // 2]
-
-    def _runs_into_another(self, tip: int, entries: list[int], ridges: Ridges) -> bool:
-        """Whether another ridge is at a tip, or, without a gap before it, the thread itself."""
-        segment, own = self.segments[tip // 2], {e // 2 for e in entries}
-        end = segment[-(tip % 2)]
-        others = [s for k, s in enumerate(self.segments) if k not in own]
-        if others and _nearest(np.concatenate(others), end)[1] < TOUCHING_PX:
-            return True
-        passing = [self.segments[k] for k in own - {tip // 2}]
-        passing.append(segment[: -2 * ARM] if tip % 2 else segment[2 * ARM :])
-        points = np.concatenate(passing)
-        if not len(points):
-            return False
-        nearest, distance = _nearest(points, end)
-        between = ridges.sample(np.linspace(end, nearest, _GAP_SAMPLES))
-        is_joined = between.min() > _GAP * min(between[0], between[-1])
-        return bool(distance < TOUCHING_PX and is_joined)
-
-
-def _nearest(points: Float64, place: Float64) -> tuple[Float64, float]:
-    """Of (k, 2) points the one nearest to a place, and how far it is."""
-    distance = np.linalg.norm(points - place, axis=1)
-    nearest = int(np.argmin(distance))
-    return points[nearest], float(distance[nearest])
 
 
 def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None = None) -> Merged:
@@ -111,7 +49,7 @@ def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None
     With `depth`, ends whose arms differ in depth are dearer to join.
     """
     if not ridges.segments:
-        return Merged((), {}, {})
+        return Merged((), {}, {}, frozenset())
     merges = price_merges(ridges, config)
     first = _merge(ridges, merges, None)
     strands = Strands(first.segments, first.partner, merges, depth)
@@ -132,7 +70,20 @@ def _merge(ridges: Ridges, merges: Merge, strands: Strands | None) -> Merged:
     segments = _share(ridges.segments, partner, price, strands)
     _open_rings(partner, price)
     _pair(partner, merges.pairs[order[merges.touching[order]]])
-    return Merged(segments, partner, price)
+    return Merged(segments, partner, price, _bent(ridges.segments, segments, partner, strands))
+
+
+def _bent(
+    originals: tuple[Float64, ...],
+    segments: tuple[Float64, ...],
+    partner: dict[int, int],
+    strands: Strands | None,
+) -> frozenset[int]:
+    if strands is None:
+        return frozenset()
+    origin = {id(s): k for k, s in enumerate(originals)}
+    ends = {e: 2 * origin[id(segments[e // 2])] + e % 2 for e in partner}
+    return frozenset(i for i, j in partner.items() if strands.bend(ends[i], ends[j]) > _BENT)
 
 
 def _uncross(
@@ -143,7 +94,7 @@ def _uncross(
 ) -> None:
     """Where one strand leads through a short segment and another beside it, swaps their far parts if
     these fit better so: short segments say little about direction."""
-    within = _within_reach(price)
+    within = within_reach(price)
     for k, segment in enumerate(segments):
         start, stop = 2 * k, 2 * k + 1
         if len(segment) >= REACH or start not in partner or stop not in partner:
@@ -313,14 +264,14 @@ def _pair(partner: dict[int, int], pairs: Int64) -> None:
 
 def _exchange(partner: dict[int, int], price: dict[tuple[int, int], float]) -> None:
     """Swaps partners as long as that lowers the total."""
-    within = _within_reach(price)
+    within = within_reach(price)
     improved = True
     while improved:
         improved = False
         for i, j in list(price):
             if partner.get(i) == j or price[i, j] >= 2 * FREE_END:
                 continue
-            added, left, pairs = _swap(i, j, partner, price, within)
+            added, left, pairs = swap(i, j, partner, price, within)
             if added < -1e-9:
                 for end in left:
                     del partner[end]
@@ -329,7 +280,8 @@ def _exchange(partner: dict[int, int], price: dict[tuple[int, int], float]) -> N
                 improved = True
 
 
-def _within_reach(price: dict[tuple[int, int], float]) -> dict[int, list[int]]:
+def within_reach(price: dict[tuple[int, int], float]) -> dict[int, list[int]]:
+    """The ends that each end might be joined to."""
     within: dict[int, list[int]] = {}
     for (i, j), cost in price.items():
         if cost < 2 * FREE_END:
@@ -337,7 +289,7 @@ def _within_reach(price: dict[tuple[int, int], float]) -> dict[int, list[int]]:
     return within
 
 
-def _swap(
+def swap(
     i: int,
     j: int,
     partner: dict[int, int],

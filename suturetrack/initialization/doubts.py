@@ -1,0 +1,140 @@
+"""What is doubtful about a thread of merged segments: where it crosses, bends, ends, or is joined."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from suturetrack.initialization.pricing import FREE_END, TOUCHING_PX
+from suturetrack.initialization.segments import ARM, Ridges, chain_tangents
+from suturetrack.initialization.topology import Merged, swap, within_reach
+from suturetrack.types import Float64
+
+Doubt = tuple[Float64, str, float]
+"""A pixel (2,), what is doubtful there, and the confidence that this leaves."""
+
+CROSSING = "an ambiguous crossing"
+"""Where the thread might leave a crossing another way."""
+JOINED = "another strand that ends on it"
+"""Where two strands come and one goes on: it may be the other one."""
+BENT = "a bend as of two strands"
+"""Where the thread may end, and another one go on from there."""
+FOREIGN = JOINED, BENT
+"""Whether a part is another thread's: what one view shows as the one, the other may as the other."""
+_FOREIGN = 0.45
+"""What such a doubt leaves of the confidence."""
+_REASSURANCE = 0.3
+"""Share of its lead over the next best way that the price of a merge is less doubtful by."""
+_STRAIN = 1.5
+"""How much of the confidence is lost with each unit of doubt that is left of the price."""
+_RUNS_ON = 0.55
+"""Price of a merge below which an end might as well run on."""
+_GAP, _GAP_SAMPLES = 0.85, 13
+"""Least ||V|| between an end and another strand, against both, below which a gap is seen there."""
+_PARALLEL = 0.7
+"""Cosine of the angle up to which a strand that ends on the thread runs into it."""
+_CLEAR, _LEAVES_PX = 0.6, 15.0
+"""Strength of such a strand, against the thread's on the weaker side, and how far it comes from, at
+least."""
+_SIDE = 40
+"""Points of the thread on each side of a place whose strength counts there."""
+
+
+def doubts(merged: Merged, entries: list[int], ridges: Ridges) -> list[Doubt]:
+    """What is doubtful about the thread that enters its segments at `entries`; `ridges` are those that
+    were merged."""
+    return [
+        (merged.segments[end // 2][-(end % 2)], why, rest)
+        for end, why, rest in (
+            *_at_merges(merged, entries),
+            *((end, JOINED, _FOREIGN) for end in _joining(merged, entries, ridges)),
+            *_at_tips(merged, entries, ridges),
+        )
+    ]
+
+
+def _at_merges(merged: Merged, entries: list[int]) -> list[tuple[int, str, float]]:
+    within = within_reach(merged.price)
+    found = []
+    for entry in entries[1:]:
+        price = merged.price[entry, merged.partner[entry]]
+        lead = min(_lead(merged, entry, entries, within), FREE_END)
+        strain = price - _REASSURANCE * lead
+        if price >= 2 * FREE_END:
+            found.append((entry, "a sharp bend", 0.6))
+        elif strain > 0:
+            found.append((entry, CROSSING, max(1 - _STRAIN * strain, 0.1)))
+        if entry in merged.bent:
+            found.append((entry, BENT, _FOREIGN))
+    return found
+
+
+def _lead(merged: Merged, entry: int, entries: list[int], within: dict[int, list[int]]) -> float:
+    """How much more the ends cost in total if another way is taken at `entry`."""
+    other = merged.partner[entry]
+    on_thread = {e // 2 for e in entries}
+    added = [
+        swap(end, rival, merged.partner, merged.price, within)[0]
+        for end, partner in ((entry, other), (other, entry))
+        for rival in within.get(end, ())
+        if rival != partner and not (merged.is_copy(rival, partner) and rival // 2 in on_thread)
+    ]
+    return max(min(added, default=1.0), 0.0)
+
+
+def _joining(merged: Merged, entries: list[int], ridges: Ridges) -> list[int]:
+    """The free ends of other strands, as clear as the thread, that run into its side."""
+    own = [merged.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
+    line, tangents = np.concatenate(own), np.concatenate([chain_tangents(s) for s in own])
+    strength, tree = ridges.sample(line), cKDTree(line)
+    found = []
+    for end in set(range(2 * len(merged.segments))) - set(merged.partner):
+        segment = merged.segments[end // 2]
+        arm = segment[:: -1 if end % 2 else 1][:ARM]
+        distance, at = tree.query(arm[0])
+        heading = chain_tangents(arm)[len(arm) // 2]
+        if distance > TOUCHING_PX or abs(float(heading @ tangents[at])) < _PARALLEL:
+            continue
+        if np.max(tree.query(segment)[0]) < _LEAVES_PX:  # Its own, or the other rim of a highlight.
+            continue
+        sides = strength[max(at - _SIDE, 0) : at + 1], strength[at : at + _SIDE]
+        level = min(float(np.median(side)) for side in sides)
+        if np.median(ridges.sample(segment)) > _CLEAR * level:
+            found.append(end)
+    return found
+
+
+def _at_tips(merged: Merged, entries: list[int], ridges: Ridges) -> list[tuple[int, str, float]]:
+    within = within_reach(merged.price)
+    found = []
+    for tip in (entries[0], entries[-1] ^ 1):
+        if _runs_into_another(merged, tip, entries, ridges):
+            on = min((merged.price[tip, j] for j in within.get(tip, ())), default=np.inf)
+            rest = 0.25 if on < _RUNS_ON else 0.4
+            found.append((tip, "an end beside another ridge", rest))
+    return found
+
+
+def _runs_into_another(merged: Merged, tip: int, entries: list[int], ridges: Ridges) -> bool:
+    """Whether another ridge is at a tip, or, without a gap before it, the thread itself."""
+    segment, own = merged.segments[tip // 2], {e // 2 for e in entries}
+    end = segment[-(tip % 2)]
+    others = [s for k, s in enumerate(merged.segments) if k not in own]
+    if others and _nearest(np.concatenate(others), end)[1] < TOUCHING_PX:
+        return True
+    passing = [merged.segments[k] for k in own - {tip // 2}]
+    passing.append(segment[: -2 * ARM] if tip % 2 else segment[2 * ARM :])
+    points = np.concatenate(passing)
+    if not len(points):
+        return False
+    at, distance = _nearest(points, end)
+    between = ridges.sample(np.linspace(end, points[at], _GAP_SAMPLES))
+    is_joined = between.min() > _GAP * min(between[0], between[-1])
+    return bool(distance < TOUCHING_PX and is_joined)
+
+
+def _nearest(points: Float64, place: Float64) -> tuple[int, float]:
+    """Which of (k, 2) points is the nearest to a place, and how far it is."""
+    distance = np.linalg.norm(points - place, axis=1)
+    nearest = int(np.argmin(distance))
+    return nearest, float(distance[nearest])
