@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack.initialization.pricing import FREE_END, TOUCHING_PX
 from suturetrack.initialization.segments import ARM, Ridges, chain_tangents
-from suturetrack.initialization.topology import Merged, swap, within_reach
+from suturetrack.initialization.topology import Merged, follow, swap, within_reach
 from suturetrack.types import Float64
 
 Doubt = tuple[Float64, str, float]
@@ -95,7 +95,8 @@ def _joining(merged: Merged, entries: list[int], ridges: Ridges) -> list[int]:
         heading = chain_tangents(arm)[len(arm) // 2]
         if distance > TOUCHING_PX or abs(float(heading @ tangents[at])) < _PARALLEL:
             continue
-        if np.max(tree.query(segment)[0]) < _LEAVES_PX:  # Its own, or the other rim of a highlight.
+        strand = [merged.segments[e // 2] for e in follow(end // 2, merged.partner)]
+        if np.max(tree.query(np.concatenate(strand))[0]) < _LEAVES_PX:  # The rim of a highlight.
             continue
         sides = strength[max(at - _SIDE, 0) : at + 1], strength[at : at + _SIDE]
         level = min(float(np.median(side)) for side in sides)
