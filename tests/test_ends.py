@@ -93,6 +93,36 @@ def test_an_end_beside_another_ridge_only_makes_good_what_is_lacking() -> None:
     assert stop == pytest.approx(8 * PIXEL)
 
 
+def test_an_end_beside_another_ridge_gives_back_what_is_too_much() -> None:
+    watch, now = settled_watch(100.0)
+    beside = replace(step_at(1.0), alone=False)
+    start, stop = watch.moves(step_at(0.0), beside, 101.0, now + FRAME_NS)
+    assert (start, stop) == (0.0, pytest.approx(100 / 101 - 1))
+
+
+@pytest.mark.parametrize(("stays", "grown"), [(True, 104.0), (False, 100.0)])
+def test_a_settled_thread_is_drawn_out_only_where_its_end_stays(stays: bool, grown: float) -> None:
+    watch, now = settled_watch(100.0)
+    length, mean = 100.0, []
+    for field in range(40):
+        now += FRAME_NS
+        shown = replace(step_at((100 + 0.1 * field) / length * 400 - 400), stays=stays)
+        length *= 1 + sum(watch.moves(step_at(0.0), shown, length, now))
+        mean.append(length)
+    assert max(mean) == pytest.approx(grown, abs=0.8)
+
+
+def test_an_end_that_creeps_on_for_long_is_believed_at_last() -> None:
+    watch, now = settled_watch(100.0)
+    longer = replace(step_at(5.0), stays=False)
+    moved_s = []
+    for _ in range(200):
+        now += FRAME_NS
+        if watch.moves(step_at(0.0), longer, 100.0, now)[1] > 2 * PIXEL:
+            moved_s.append(now * 1e-9)
+    assert 4.5 < moved_s[0] - 40 * FRAME_NS * 1e-9 < 5.5
+
+
 def test_a_loop_that_is_drawn_shut_moves_no_end() -> None:
     watch, now = settled_watch(100.0)
     for _ in range(10):

@@ -39,6 +39,8 @@ class EndStep:
     """Whether the image's border cuts the thread."""
     alone: bool = True
     """Whether no other ridge runs beside the end, which it could run on along."""
+    stays: bool = True
+    """Whether the end has kept its place, as where the thread is drawn out of something."""
 
     @property
     def offset(self) -> float:
@@ -181,6 +183,8 @@ _DRAWN_PX = 6.0
 _CUT_PX = 3.0
 _SETTLING_S = 0.3
 _HELD_S = 1.5
+# A length that is settled grows by no more than this for so long where the end has not kept its place.
+_CREPT_PX, _KEPT_S = 3.0, 5.0
 # A length that has kept within this part for so long is the thread's own.
 _STEADY = 0.015
 _SETTLED_S = 0.7
@@ -194,7 +198,9 @@ class EndWatch:
     What one end loses and the other gains is the thread sliding along itself. A thread that is
     suddenly shorter at an end is hidden there, one that is suddenly longer than it ever was has met
     something that looks like it: its length is then held for a while, the more firmly the longer it
-    was steady. An end beside which another ridge runs only makes good what is lacking.
+    was steady. A thread that has a length of its own is drawn out only where its end stays, and not where
+    it creeps on along a tool. An end beside which another ridge runs makes good what is lacking, and
+    gives back what is too much.
     """
 
     def __init__(self, length: float, now_ns: int) -> None:
@@ -223,12 +229,12 @@ class EndWatch:
         for end in doubted:
             lacking = self.length / length - 1.0 - offsets[1 - end]
             step = steps[end]
+            bound = 0.0 if step is None else _DRAWN_PX * step.pixel
             if step is not None and not step.alone:
-                offsets[end] = min(max(step.offset, 0.0), max(lacking, 0.0))
-            elif step is None or len(doubted) == 2:
+                offsets[end] = max(min(max(step.offset, 0.0), lacking), -bound)
+            elif len(doubted) == 2:
                 offsets[end] = 0.0
             else:
-                bound = _DRAWN_PX * step.pixel
                 offsets[end] = min(max(lacking, -bound), bound)
         for end in (0, 1):
             if seen[end]:
@@ -254,17 +260,26 @@ class EndWatch:
             return doubted
         if (now_ns - self._found_ns) * _NS < _SETTLING_S:
             return []
+        unseen_s = [(now_ns - seen_ns) * _NS for seen_ns in self._seen_ns]
         slack = _DRAWN_PX * max(step.pixel for step in shown) * length
         total = length * (1.0 + sum(offsets))
+        longer = int(np.argmax(offsets))
+        if self._creeps(shown[longer], total, length) and unseen_s[longer] < _KEPT_S:
+            return [longer]
         if total > max(self.length, self._longest) + slack:
-            return [int(np.argmax(offsets))]
+            return [longer]
         if total < self.length - slack:
             doubted = [
                 end
                 for end, step in enumerate(shown)
                 if step.offset_px < -_CUT_PX and offsets[end] <= min(offsets) / 2
             ]
-        return [end for end in doubted if (now_ns - self._seen_ns[end]) * _NS < _HELD_S]
+        return [end for end in doubted if unseen_s[end] < _HELD_S]
+
+    def _creeps(self, step: EndStep, total: float, length: float) -> bool:
+        """Whether the thread would grow, to a total length, at an end that runs on."""
+        is_own = self.settled and not self.at_border
+        return is_own and not step.stays and total > self._steady + _CREPT_PX * step.pixel * length
 
     def _remember(self, length: float, now_ns: int) -> None:
         if abs(length / self._steady - 1) > _STEADY:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from suturetrack.camera import StereoRig
@@ -48,7 +50,8 @@ class Mouth:
         rig: StereoRig,
         now_ns: int,
     ) -> EndStep | None:
-        """The step to the mouth, where the end `end` (0 or 1) of the curve is at one.
+        """The step to the mouth, where the end `end` (0 or 1) of the curve is at one; else the step, and
+        whether the end stays.
 
         The `other` end must have moved meanwhile: where one of two lies still, that is the mouth.
         """
@@ -61,7 +64,7 @@ class Mouth:
         elif not self.is_open or now_ns - self._near_ns > _LEAVES_NS:
             self.is_open, self._place = False, None
         if not self.is_open or self._place is None:
-            return step
+            return step and replace(step, stays=now_ns - self.since_ns > _STAYS_NS)
         offset_px = float(np.sum((self._place - tip) * outward)) / self._pixel
         offset_px = min(max(offset_px, -_CALM_PX), _CALM_PX)
         return EndStep(offset_px, self._pixel / length, at_border=False)
