@@ -285,14 +285,15 @@ def test_a_plain_look_takes_the_place_of_a_hopeless_one_at_once(
     assert max(rms(state, pair(i)[1]) for i, state in enumerate(states) if i >= sure) < 0.25
 
 
-def test_what_was_never_sure_does_not_tell_the_length(
-    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("first", "later"), [(0.6, 1.0), (1.0, 0.3)])
+def test_what_was_never_sure_does_not_tell_the_length_but_is_no_stub(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, first: float, later: float
 ) -> None:
     def look(field: RidgeField, *more: object) -> Initialization:
         found = initialize(field, *more)  # type: ignore[arg-type]
         if field.stamp.frame:
-            return found
-        return replace(found, curve=nurbs.part(found.curve, 0.0, 0.6), confidence=0.1)
+            return replace(found, curve=nurbs.part(found.curve, 0.0, later), confidence=0.9)
+        return replace(found, curve=nurbs.part(found.curve, 0.0, first), confidence=0.1)
 
     looks_by(monkeypatch, look)
     truths, away = [thread(i / FPS) for i in range(FPS)], range(3, 14)
@@ -302,10 +303,13 @@ def test_what_was_never_sure_does_not_tell_the_length(
         tracker.step(paint(rig, [] if i in away else [points], i)).states[0]
         for i, points in enumerate(truths)
     ]
-    assert states[0].length < 0.7 * metrics.polyline_length(truths[0])
+    whole = metrics.polyline_length(truths[0])
+    assert states[0].length == pytest.approx(first * whole, rel=0.1)
     assert states[away[-1]].status is Status.LOST
-    assert states[-1].status is Status.TRACKING
-    assert rms(states[-1], truths[-1]) < 0.15
+    is_found = "found again" in sum((state.events for state in states), ())
+    assert is_found == (later == 1.0)
+    assert states[-1].length > 0.8 * whole
+    assert not is_found or rms(states[-1], truths[-1]) < 0.15
 
 
 def test_a_curve_that_lacks_an_end_is_what_a_look_finds(rig: StereoRig) -> None:

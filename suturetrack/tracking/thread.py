@@ -26,6 +26,8 @@ from suturetrack.types import Energies, Float64, Nurbs, RidgeField, Seed, Stamp,
 _REST = 4
 _QUICK_ATTEMPTS = 6
 _RAREST = 3
+# A thread that was never sure is no stub of what it was found as, against the longest.
+_STUB = 0.5
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
 
@@ -54,6 +56,7 @@ class Thread:
         self._sureness: Sureness | None = None
         self._strangers = Strangers()
         self._was_sure = last is not None
+        self._longest = 0.0
         self._seeded_at = 0.5
         self._rest = self._failures = 0
 
@@ -214,6 +217,7 @@ class Thread:
         is_worse = self._state.status is not Status.TRACKING and (is_sure or not self.is_held)
         # What is followed may have shrunk from what was found.
         is_whole = has_length(outcome.state.curve, known_lengths)
+        is_whole &= not self._is_stub(outcome.state)
         if is_worse and is_whole and outcome.state.status is Status.TRACKING:
             is_known = self._was_followed_for_sure(outcome.state.curve)
             self._hold(outcome, "found again", self._sureness if is_known else None)
@@ -225,11 +229,17 @@ class Thread:
         before = self.follower.model.curve, self.follower.last_good
         return any(self._sureness.is_same(found, curve) for curve in before)
 
+    def _is_stub(self, found: ThreadState) -> bool:
+        """Whether a thread that was never sure would be far shorter than it was found before."""
+        return not self._was_sure and found.length < _STUB * self._longest
+
     def _take_closer(self, search: Closer, outcome: Outcome) -> None:
         assert isinstance(outcome.found, Initialization)
         assert self._sureness is not None
         found = outcome.found
         if outcome.state is None or outcome.state.status is Status.LOST:
+            return
+        if self._is_stub(outcome.state):
             return
         if self._sureness.weigh(found.confidence, found.curve, search.followed):
             self._seeded_at = _nearest(found.curve, search.seed, self._setup.rig)
@@ -252,6 +262,7 @@ class Thread:
             self._setup.rig,
         )
         self._rest = self._failures = 0
+        self._longest = max(self._longest, state.length)
         self._come_to(replace(state, events=(event, *state.events)))
 
     @property
