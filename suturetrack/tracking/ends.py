@@ -183,8 +183,8 @@ _DRAWN_PX = 6.0
 _CUT_PX = 3.0
 _SETTLING_S = 0.3
 _HELD_S = 1.5
-# A length that is settled grows by no more than this for so long where the end has not kept its place.
-_CREPT_PX, _KEPT_S = 3.0, 5.0
+# How long a thread does not grow beyond a length of its own if neither end keeps its place.
+_KEPT_S = 5.0
 # A length that has kept within this part for so long is the thread's own.
 _STEADY = 0.015
 _SETTLED_S = 0.7
@@ -198,9 +198,9 @@ class EndWatch:
     What one end loses and the other gains is the thread sliding along itself. A thread that is
     suddenly shorter at an end is hidden there, one that is suddenly longer than it ever was has met
     something that looks like it: its length is then held for a while, the more firmly the longer it
-    was steady. A thread that has a length of its own is drawn out only where its end stays, and not where
-    it creeps on along a tool. An end beside which another ridge runs makes good what is lacking, and
-    gives back what is too much.
+    was steady. A thread that has a length of its own is drawn out only while an end stays, and not where
+    both move: there one creeps on along a tool. An end beside which another ridge runs makes good what
+    is lacking, and gives back what is too much.
     """
 
     def __init__(self, length: float, now_ns: int) -> None:
@@ -264,7 +264,8 @@ class EndWatch:
         slack = _DRAWN_PX * max(step.pixel for step in shown) * length
         total = length * (1.0 + sum(offsets))
         longer = int(np.argmax(offsets))
-        if self._creeps(shown[longer], total, length) and unseen_s[longer] < _KEPT_S:
+        stays = any(step.stays for step in shown)
+        if not stays and self._has_grown(total, slack / 2) and unseen_s[longer] < _KEPT_S:
             return [longer]
         if total > max(self.length, self._longest) + slack:
             return [longer]
@@ -276,10 +277,9 @@ class EndWatch:
             ]
         return [end for end in doubted if unseen_s[end] < _HELD_S]
 
-    def _creeps(self, step: EndStep, total: float, length: float) -> bool:
-        """Whether the thread would grow, to a total length, at an end that runs on."""
-        is_own = self.settled and not self.at_border
-        return is_own and not step.stays and total > self._steady + _CREPT_PX * step.pixel * length
+    def _has_grown(self, total: float, slack: float) -> bool:
+        """Whether a total length is more than the thread's own, where that is known."""
+        return self.settled and not self.at_border and total > self._steady + slack
 
     def _remember(self, length: float, now_ns: int) -> None:
         if abs(length / self._steady - 1) > _STEADY:
