@@ -16,6 +16,7 @@ from suturetrack.initialization import Initialization, initialize
 from suturetrack.initialization.matching import raised
 from suturetrack.tracking import Tracker
 from suturetrack.tracking.follower import Follower
+from suturetrack.tracking.recovery import directed
 from suturetrack.tracking.sureness import Sureness
 from suturetrack.types import RidgeField, Seed, Status, ThreadState
 from tests.painting import FPS, paint, thread
@@ -318,16 +319,48 @@ def test_what_was_never_sure_does_not_tell_the_length_but_is_no_stub(
 
 def test_a_curve_that_lacks_an_end_is_what_a_look_finds(rig: StereoRig) -> None:
     field = paint(rig, [thread(0.0)], 0)
-    whole = initialize(field, rig, seed_on(rig, thread(0.0))).curve
+    look = initialize(field, rig, seed_on(rig, thread(0.0)))
+    whole = look.curve
     short, shorter = nurbs.part(whole, 0.0, 0.93), nurbs.part(whole, 0.0, 0.8)
     for followed, found, is_sure in (
         (short, whole, True),
         (whole, short, False),
         (shorter, whole, False),
     ):
-        sureness = Sureness(0.3, followed, 0, rig)
-        takes_place = sureness.weigh(0.6, found, followed)
+        sureness = Sureness(replace(look, confidence=0.3), followed, 0, rig)
+        takes_place = sureness.weigh(replace(look, curve=found, confidence=0.6), followed)
         assert (sureness.is_sure, takes_place) == (is_sure, True)
+
+
+@pytest.mark.parametrize("is_clear_once", [True, False])
+def test_places_that_are_clear_in_one_look_each_are_sure_together(
+    rig: StereoRig, is_clear_once: bool
+) -> None:
+    near, far = (0.3, 0.4), (0.7, 0.4)
+    seen = [(near, far), (near,), (far,)] if is_clear_once else 3 * [(near, far)]
+    looks = []
+    for turn, left in enumerate(seen):
+        truth = thread(0.6 * turn)
+        found = initialize(paint(rig, [truth], turn), rig, seed_on(rig, truth))
+        rest = 0.4 ** len(left)
+        looks.append(replace(found, confidence=0.9 * rest, doubts=(left, ())))
+    sureness = Sureness(looks[0], looks[0].curve, 0, rig)
+    for look in looks[1:]:
+        assert not sureness.is_sure
+        assert not sureness.weigh(look, look.curve)
+    assert sureness.is_sure == is_clear_once
+    sureness.revoke(1)
+    sureness.weigh(looks[0], looks[0].curve)
+    assert not sureness.is_sure
+
+
+def test_doubts_run_with_the_curve(rig: StereoRig) -> None:
+    found = initialize(paint(rig, [thread(0.0)], 0), rig, seed_on(rig, thread(0.0)))
+    found = replace(found, doubts=(((0.2, 0.5),), ()))
+    assert directed(found, found.curve) is found
+    turned = directed(found, nurbs.reversed_curve(found.curve))
+    assert turned.doubts == (((0.8, 0.5),), ())
+    np.testing.assert_allclose(turned.curve.control_points, found.curve.control_points[::-1])
 
 
 @pytest.mark.parametrize("other", [False, True])

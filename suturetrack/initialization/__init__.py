@@ -19,7 +19,9 @@ from suturetrack.initialization.model import (
     Initialization,
     InitializationConfig,
     InitializationError,
+    PlacedDoubts,
     ViewGrowth,
+    remaining,
 )
 from suturetrack.initialization.segments import Ridges, find_ridges, thread_scale
 from suturetrack.nurbs import curve_from
@@ -30,8 +32,10 @@ __all__ = [
     "Initialization",
     "InitializationConfig",
     "InitializationError",
+    "PlacedDoubts",
     "ViewGrowth",
     "initialize",
+    "remaining",
 ]
 
 
@@ -174,8 +178,8 @@ def _reconstruct(
             f"no curve fits both views: {error}", candidates, growth
         ) from None
     shown = rig.with_row_offset(rows)
-    confidence, reasons = judge(curve, samples, sigma, found.chains, ridges, shown, scale)
-    return Initialization(curve, confidence, reasons, samples.distance_px, growth, rows)
+    confidence, reasons, doubts = judge(curve, samples, sigma, found.chains, ridges, shown, scale)
+    return Initialization(curve, confidence, reasons, samples.distance_px, growth, doubts, rows)
 
 
 def _reduced(view: Float32, scale: int) -> Float32:

@@ -11,6 +11,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization.doubts import CROSSING, FOREIGN, Doubt
 from suturetrack.initialization.fitting import Samples
 from suturetrack.initialization.growth import Chain
+from suturetrack.initialization.model import PlacedDoubts, remaining
 from suturetrack.initialization.segments import Ridges
 from suturetrack.metrics import coverage, polyline_length
 from suturetrack.types import Float64, Nurbs
@@ -50,8 +51,8 @@ def judge(
     ridges: tuple[Ridges, Ridges],
     rig: StereoRig,
     scale: int,
-) -> tuple[float, tuple[str, ...]]:
-    """Confidence in [0, 1] and its reasons.
+) -> tuple[float, tuple[str, ...], PlacedDoubts]:
+    """Confidence in [0, 1], its reasons, and the doubts that it is lowered by.
 
     Args:
         curve: the result.
@@ -82,7 +83,8 @@ def judge(
             f"{why} in the {name} view at ({scale * u:.0f}, {scale * v:.0f})"
             for (u, v), why, _ in doubts[view]
         ]
-    confidence *= min(_remaining(view, doubts, pixels, chains) for view in (0, 1))
+    left, right = (_placed(view, doubts, pixels, chains) for view in (0, 1))
+    confidence *= remaining((left, right))
     for end in (0, 1):
         readings = [samples.ends[view][end] for view in (0, 1)]
         if any(r.at_border for r in readings):
@@ -90,7 +92,7 @@ def judge(
         elif all(np.isnan(r.offset_px) for r in readings):
             confidence *= 0.7
             reasons.append(f"{_ORDINAL[end]} end not seen as an end")
-    return float(confidence), tuple(reasons)
+    return float(confidence), tuple(reasons), (left, right)
 
 
 _ORDINAL = ("first", "last")
@@ -121,29 +123,31 @@ def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
     return kept
 
 
-def _remaining(
+def _placed(
     view: int,
     doubts: list[list[Doubt]],
     lines: tuple[Float64, Float64],
     chains: tuple[Chain, Chain],
-) -> float:
-    """What the doubts of a view leave of the confidence; `lines` are the curve in both views.
+) -> tuple[tuple[float, float], ...]:
+    """Where on the curve a view is in doubt, and what that leaves; `lines` are the curve in both views.
 
     Two views that come to the same by themselves are not both mistaken easily, but what neither
     could tell stays doubtful.
     """
     line, counterpart = lines[view], lines[1 - view]
-    left = 1.0
+    placed = []
     for place, why, rest in doubts[view]:
-        there = counterpart[np.argmin(np.linalg.norm(line - place, axis=1))]
+        at = int(np.argmin(np.linalg.norm(line - place, axis=1)))
+        there = counterpart[at]
         both = max(rest, min(_same(why, there, doubts[1 - view]), default=1.0))
         if not _is_shared(place, line, counterpart, chains[1 - view].pixels):
-            left *= rest
+            left = rest
         elif why in (CROSSING, *FOREIGN) and both < _GRAVE:
-            left *= both
+            left = both
         else:
-            left *= np.sqrt(rest)
-    return left
+            left = float(np.sqrt(rest))
+        placed.append((at / (len(line) - 1), left))
+    return tuple(placed)
 
 
 def _confirmed(view: int, doubts: list[list[Doubt]], lines: tuple[Float64, Float64]) -> list[Doubt]:

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from suturetrack.types import Float32, Float64, Nurbs
+
+PlacedDoubts = tuple[tuple[tuple[float, float], ...], tuple[tuple[float, float], ...]]
+"""The parameters of a curve where the left and the right view are in doubt, and what each leaves of the
+confidence."""
+
+
+def remaining(doubts: PlacedDoubts) -> float:
+    """What doubts leave of the confidence: those of the view that has the graver ones count."""
+    return min(math.prod(rest for _, rest in view) for view in doubts)
 
 
 @dataclass(frozen=True)
@@ -77,6 +87,8 @@ class Initialization:
     reprojection_px: float
     """Mean distance of the projected curve from the crest of the ridge, both views, px."""
     growth: Growth
+    doubts: PlacedDoubts = ((), ())
+    """Those of the left and of the right view that the confidence is lowered by."""
     row_offset_px: float = 0.0
     """How much lower, against the left view, than the calibration says the right view lies; the curve
     is half of it off in each. 0 where that cannot be told from none."""

@@ -37,11 +37,11 @@ class Pursuit:
     ) -> None:
         self._seed, self._setup = seed, setup
         self.follower = setup.follower(found, field)
-        self.confidence = found.confidence
-        """Of the look that found what is followed."""
+        self.found = found
+        """What is followed, as it was found."""
         if before is not None:
             self.follower.remember(before)
-        self._found = (field.stamp.capture_ns, found.curve) if is_fresh else None
+        self._found_at = (field.stamp.capture_ns, found.curve) if is_fresh else None
 
     def step(self, field: RidgeField, others: Neighbours) -> ThreadState:
         """The thread in the next field; if it has just been found and runs away, where it is found."""
@@ -55,13 +55,15 @@ class Pursuit:
         return lies_on(self.follower.model.curve, others, self.follower.rig)
 
     def _is_fresh(self, field: RidgeField) -> bool:
-        return self._found is not None and 0 < field.stamp.capture_ns - self._found[0] < _JUST_NS
+        return (
+            self._found_at is not None and 0 < field.stamp.capture_ns - self._found_at[0] < _JUST_NS
+        )
 
     def _find_once_more(
         self, state: ThreadState, field: RidgeField, others: Neighbours
     ) -> ThreadState | None:
         """Where the thread is found twice in a row, the step between tells its velocity."""
-        assert self._found is not None
+        assert self._found_at is not None
         old = self.follower
         starts = starts_on(old.last_good, self._seed, field, old.rig)
         found = find_again(old.last_good, old.known_lengths, starts, field, self._setup)
@@ -74,8 +76,8 @@ class Pursuit:
         again = follower.step(field, self._seed.thread, others)
         if again.status is not Status.TRACKING:
             return None
-        before_ns, before = self._found
+        before_ns, before = self._found_at
         follower.came_from(before, (field.stamp.capture_ns - before_ns) * 1e-9)
-        self.follower, self.confidence = follower, found.confidence
-        self._found = field.stamp.capture_ns, follower.model.curve
+        self.follower, self.found = follower, found
+        self._found_at = field.stamp.capture_ns, follower.model.curve
         return replace(again, events=("found again", *again.events))

@@ -67,7 +67,7 @@ def find_again(
         except InitializationError:
             continue
         if has_length(found.curve, known_lengths):
-            return replace(found, curve=directed(found.curve, last))
+            return directed(found, last)
         if is_brief:
             break
     return None
@@ -114,12 +114,15 @@ def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
     return bool(np.mean(~alone) > _SHARED)
 
 
-def directed(curve: Nurbs, last: Nurbs) -> Nurbs:
-    """The curve in the direction of the last one."""
+def directed(found: Initialization, last: Nurbs) -> Initialization:
+    """What was found, run in the direction of the last curve."""
 
     def apart(a: Nurbs) -> float:
         s: Float64 = np.linspace(0, 1, 16)
         return float(np.linalg.norm(evaluate(a, s) - evaluate(last, s), axis=1).sum())
 
-    other = reversed_curve(curve)
-    return other if apart(other) < apart(curve) else curve
+    other = reversed_curve(found.curve)
+    if apart(other) >= apart(found.curve):
+        return found
+    left, right = (tuple((1 - s, rest) for s, rest in view) for view in found.doubts)
+    return replace(found, curve=other, doubts=(left, right))

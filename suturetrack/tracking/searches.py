@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
@@ -40,7 +40,7 @@ class FromSeed:
             return error
         if self.toward is None:
             return found
-        return replace(found, curve=directed(found.curve, self.toward))
+        return directed(found, self.toward)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows the first curve."""
@@ -101,7 +101,7 @@ class Closer:
         rig = self.setup.rig.with_row_offset(found.row_offset_px)
         if lies_on(found.curve, others, rig) or not has_length(found.curve, known_lengths):
             return None
-        return replace(found, curve=directed(found.curve, self.followed))
+        return directed(found, self.followed)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows what this look found."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from suturetrack.camera import StereoRig
+from suturetrack.initialization import Initialization, PlacedDoubts, remaining
 from suturetrack.metrics import resample
 from suturetrack.nurbs import evaluate
 from suturetrack.types import Float64, Nurbs
@@ -13,6 +14,10 @@ SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
 # Votes for a curve that make it sure, in those of a look that is just sure by itself.
 _ENOUGH = 1.5
+# What the doubts that no look has settled leave of a curve that is sure, and how far apart two doubts
+# about one place are, along the curve.
+_TOGETHER = 0.6
+_SAME_PLACE = 0.05
 # And those that the look by which another curve was voted down has to have more.
 _PLENTY = 3.0
 # Two looks see the same if they are nowhere further apart, and another thing if they are somewhere.
@@ -38,17 +43,22 @@ class Sureness:
     the same picture says nothing new: it counts only if the thread has bent since the last one that
     did, or if it is sure by itself.
 
+    A place that one look doubts may be clear in another one that finds the same: of each doubt of the
+    first look only the least is left that any has there.
+
     Args:
-        confidence: of the look that found the curve.
-        curve: what it found.
+        found: what the first look found.
+        curve: where it is followed.
         now_ns: capture time of the field.
         rig: the cameras.
     """
 
-    def __init__(self, confidence: float, curve: Nurbs, now_ns: int, rig: StereoRig) -> None:
-        self.is_sure = confidence >= SURE
+    def __init__(self, found: Initialization, curve: Nurbs, now_ns: int, rig: StereoRig) -> None:
+        self.is_sure = found.confidence >= SURE
         """Whether the curve that is followed may be called the thread."""
-        self._rig, self._votes = rig, _votes(confidence)
+        self._rig, self._votes = rig, _votes(found.confidence)
+        self._evidence = _evidence(found)
+        self._doubts: PlacedDoubts | None = found.doubts
         self._shape = self._outline(curve)
         self._looks, self._last_ns = 0, now_ns
 
@@ -66,13 +76,15 @@ class Sureness:
         """Makes what was sure open again: looks have to tell."""
         if self.is_sure:
             self.is_sure, self._votes = False, 0.0
+            self._evidence, self._doubts = 0.0, None
             self._looks, self._last_ns = 0, now_ns
 
-    def weigh(self, confidence: float, found: Nurbs, followed: Nurbs) -> bool:
+    def weigh(self, found: Initialization, followed: Nurbs) -> bool:
         """Adds a look; whether what it found, in the direction of what is followed, takes its place."""
-        places = self._outline(found), self._outline(followed)
+        confidence = found.confidence
+        places = self._outline(found.curve), self._outline(followed)
         apart = float(np.linalg.norm(places[0] - places[1], axis=2).max())
-        agrees = apart < _SAME_PX or self.is_same(found, followed)
+        agrees = apart < _SAME_PX or self.is_same(found.curve, followed)
         if confidence >= SURE and (agrees or apart < _OTHER_PX):
             self.is_sure = True
             return apart >= _SAME_PX
@@ -84,6 +96,12 @@ class Sureness:
         is_outvoted = self._votes < 0
         self.is_sure = self._votes >= _ENOUGH if agrees else -self._votes >= _PLENTY
         self._votes, self._shape = abs(self._votes), places[0 if is_outvoted else 1]
+        if is_outvoted:
+            self._evidence, self._doubts = _evidence(found), found.doubts
+        elif agrees:
+            self._evidence = max(self._evidence, _evidence(found))
+            self._doubts = _lessened(self._doubts or found.doubts, found.doubts)
+            self.is_sure |= self._evidence * remaining(self._doubts) >= _TOGETHER
         return is_outvoted
 
     def is_same(self, found: Nurbs, followed: Nurbs) -> bool:
@@ -120,6 +138,23 @@ def _apart(whole: Float64, part: Float64) -> float:
     )
     there = resample(whole[start : len(whole) - stop], _PLACES)
     return float(np.linalg.norm(there - resample(part, _PLACES), axis=1).max())
+
+
+def _evidence(found: Initialization) -> float:
+    """The confidence in a look before its doubts."""
+    return min(found.confidence / max(remaining(found.doubts), 1e-9), 1.0)
+
+
+def _lessened(doubts: PlacedDoubts, later: PlacedDoubts) -> PlacedDoubts:
+    """What is left of doubts once another look at the same curve has had its own."""
+    left, right = (
+        tuple(
+            (s, max(rest, min((r for at, r in now if abs(at - s) < _SAME_PLACE), default=1.0)))
+            for s, rest in before
+        )
+        for before, now in zip(doubts, later, strict=True)
+    )
+    return left, right
 
 
 def _votes(confidence: float) -> float:

@@ -213,7 +213,7 @@ class Thread:
         assert outcome.state is not None
         if outcome.state.curve is None:
             return
-        is_sure = outcome.pursuit.confidence >= SURE
+        is_sure = outcome.pursuit.found.confidence >= SURE
         is_worse = self._state.status is not Status.TRACKING and (is_sure or not self.is_held)
         # What is followed may have shrunk from what was found.
         is_whole = has_length(outcome.state.curve, known_lengths)
@@ -241,7 +241,7 @@ class Thread:
             return
         if self._is_stub(outcome.state):
             return
-        if self._sureness.weigh(found.confidence, found.curve, search.followed):
+        if self._sureness.weigh(found, search.followed):
             self._seeded_at = _nearest(found.curve, search.seed, self._setup.rig)
             event = "found for sure" if self._sureness.is_sure else "found elsewhere"
             self._hold(outcome, event, self._sureness)
@@ -256,7 +256,7 @@ class Thread:
         self._pursuit, state = outcome.pursuit, outcome.state
         self._strangers = self._strangers.of_another()
         self._sureness = sureness or Sureness(
-            outcome.pursuit.confidence,
+            outcome.pursuit.found,
             outcome.pursuit.follower.model.curve,
             state.stamp.capture_ns,
             self._setup.rig,
