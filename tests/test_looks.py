@@ -286,6 +286,25 @@ def test_a_plain_look_takes_the_place_of_a_hopeless_one_at_once(
     assert max(rms(state, pair(i)[1]) for i, state in enumerate(states) if i >= sure) < 0.25
 
 
+@pytest.mark.parametrize(("confidence", "from_seed"), [(0.01, True), (0.3, False)])
+def test_a_hopeless_curve_is_no_place_to_look_from(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, confidence: float, from_seed: bool
+) -> None:
+    seeds: list[Seed] = []
+
+    def look(field: RidgeField, rig: StereoRig, seed: Seed, _: object) -> Initialization:
+        seeds.append(seed)
+        return replace(initialize(field, rig, seed), confidence=confidence)
+
+    looks_by(monkeypatch, look)
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, pair(0)[0]))
+    for field in fields_of(rig, FPS, range(0)):
+        tracker.step(field)
+    assert len(seeds) > 1
+    assert [seed == seeds[0] for seed in seeds[1:]] == [from_seed] * (len(seeds) - 1)
+
+
 @pytest.mark.parametrize(("first", "later"), [(0.6, 1.0), (1.0, 0.3)])
 def test_what_was_never_sure_does_not_tell_the_length_but_is_no_stub(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch, first: float, later: float

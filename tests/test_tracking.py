@@ -158,6 +158,29 @@ def test_a_thread_that_moves_across_itself_is_expected_to_fade(rig: StereoRig) -
     assert faster[0] > 0.1
 
 
+@pytest.mark.parametrize("relief", [2.5, -2.5])
+def test_a_stretch_keeps_its_depth_while_it_runs_along_an_epipolar_line(
+    rig: StereoRig, relief: float
+) -> None:
+    x = np.linspace(-25, 25, 800)
+    middle = np.clip(x / 10, -1, 1)
+    steep = 0.8 * np.sign(x) * np.maximum(np.abs(x) - 10, 0)
+    depth = 200 + relief * np.cos(np.pi / 2 * middle) ** 2
+    truths = [
+        np.c_[x, steep + 3 * np.cos(np.pi * i / 40) * np.sin(np.pi * middle), depth]
+        for i in range(100)
+    ]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    assert all(state.status is Status.TRACKING for state in states)
+    off = [
+        metrics.curve_error(nurbs.evaluate(state.curve, np.linspace(0, 1, 400)), points).rms
+        for state, points in zip(states, truths, strict=True)
+        if state.curve is not None
+    ]
+    assert max(off) < 0.65
+
+
 def test_an_end_that_is_hidden_for_a_moment_makes_the_thread_no_shorter(rig: StereoRig) -> None:
     whole = thread(0.0)
     hidden = range(30, 36)

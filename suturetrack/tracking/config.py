@@ -49,7 +49,7 @@ class TrackingConfig:
     """How far the thread may leave the prediction from one field to the next, as a standard
     deviation; unseen stretches are held to the prediction by this."""
     smoothing: float = 100.0
-    """Weight of the curve's bending; without unit."""
+    """Weight of the change of the curve's bending; without unit."""
     stretch: float = 0.02
     """Standard deviation of the local stretch of the curve, relative."""
     samples_per_span: int = 5

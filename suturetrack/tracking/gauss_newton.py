@@ -33,6 +33,8 @@ _HIDDEN_DRIFT_PX = 3.0
 # and in depth, against its errors around.
 _CROWDED_WORTH, _CROWDED_HOLD = 0.02, 0.3
 _LEAST_SURPRISE_PX, _SMOOTH = 0.3, 9
+# Share of its second derivatives that the curve is asked to keep where the prediction holds.
+_KEPT = 0.95
 # A first search does not know the thread's direction yet where it has bent.
 _LENIENCY = 0.4
 _EVEN = 150.0
@@ -254,7 +256,7 @@ class _Linearized:
                 view.tangents, view.jacobian, weight, found.offset, information, pull
             )
         equations.add(self.samples, 0, information, pull)
-        equations.add(self.samples, 2, *self._shape(reference, config))
+        equations.add(self.samples, 2, *self._shape(reference, config, surprise))
         return equations
 
     def _past(
@@ -271,22 +273,24 @@ class _Linearized:
         held = firmness * self._amounts[0] * self._per_unit**2
         return rows.held_rows(jacobians, reference.points - self.points, drift, held)
 
-    def _shape(self, reference: _Reference, config: TrackingConfig) -> tuple[Float64, Float64]:
-        """Little bending, and an even speed along the curve: f'' across and along the tangent.
+    def _shape(
+        self, reference: _Reference, config: TrackingConfig, surprise: Float64
+    ) -> tuple[Float64, Float64]:
+        """Little change of f'' across and along the tangent: a thread keeps its bends and its speed.
 
-        Where the thread is hidden it keeps the bends that it had. No length is asked for: noise in
-        depth only ever adds to the length, and a goal taken from the curve would keep what it adds.
+        So lengths stay where they were, which tells the depth of stretches along the epipolar lines. Where
+        the prediction has failed, little bending and an even speed are all there is to ask for. No length
+        is: noise in depth only ever adds to it, and a goal taken from the curve would keep what it adds.
         """
         speed = reference.speed
         bending = config.smoothing * self.samples.share / (self._per_unit * speed**3)
         stretch = self._amounts[0] / (config.stretch * speed) ** 2 / _EVEN**2
-        goal = np.where(self._hidden[:, None], reference.second, 0.0) - self.second
+        kept = np.where(self._hidden, 1.0, _KEPT / (1 + surprise**2))
+        goal = kept[:, None] * reference.second - self.second
         return rows.shape_rows(self.first, goal, bending, stretch)
 
     def surprise(self, crowd: Bool) -> Float64:
         """(k,) px by which the thread has left the curve where it is alone, and so in between."""
-        if not crowd.any():
-            return np.ones(len(crowd))
         left, right = (np.where(crowd, 0.0, np.abs(found.offset)) for found in self.offsets)
         away, either, s = np.maximum(left, right), ~(crowd | self._hidden), self.samples.s
         if not either.any():

@@ -13,7 +13,7 @@ from suturetrack.types import Float64, Nurbs
 SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
 # Votes for a curve that make it sure, in those of a look that is just sure by itself.
-_ENOUGH = 1.5
+_ENOUGH, _HOPELESS = 1.5, 0.01
 # What the doubts that no look has settled leave of a curve that is sure, and how far apart two doubts
 # about one place are, along the curve.
 _TOGETHER = 0.6
@@ -61,6 +61,11 @@ class Sureness:
         self._doubts: PlacedDoubts | None = found.doubts
         self._shape = self._outline(curve)
         self._looks, self._last_ns = 0, now_ns
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether next to nothing speaks for the curve that is followed."""
+        return self._votes < _HOPELESS
 
     def asks_for_look(self, curve: Nurbs, now_ns: int) -> bool:
         """Whether it is time to look again at what is followed."""

@@ -177,9 +177,16 @@ class Thread:
         curve = self.follower.model.curve
         if not self._sureness.asks_for_look(curve, now_ns):
             return None
-        x, y, z = (float(c) for c in evaluate(curve, np.array([self._seeded_at]))[0])
         before = copy.copy(self.follower) if self._was_sure else None
-        return Closer(Seed(self.name, point=(x, y, z)), self._setup, curve, before)
+        return Closer(self._place_to_look_from(curve), self._setup, curve, before)
+
+    def _place_to_look_from(self, curve: Nurbs) -> Seed:
+        """On the curve where it was found; a hopeless one is not what was meant by the seed."""
+        assert self._sureness is not None
+        if self._sureness.is_hopeless:
+            return self._seed
+        x, y, z = (float(c) for c in evaluate(curve, np.array([self._seeded_at]))[0])
+        return Seed(self.name, point=(x, y, z))
 
     def take_up(self, look: Look, others: Neighbours) -> None:
         """Goes on with what a look found, if that is worth more.
