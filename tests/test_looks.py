@@ -369,6 +369,7 @@ def test_places_that_are_clear_in_one_look_each_are_sure_together(
         assert not sureness.weigh(look, look.curve)
     assert sureness.is_sure == is_clear_once
     sureness.revoke(1)
+    assert not sureness.is_hopeless
     sureness.weigh(looks[0], looks[0].curve)
     assert not sureness.is_sure
 

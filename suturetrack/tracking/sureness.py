@@ -13,13 +13,14 @@ from suturetrack.types import Float64, Nurbs
 SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
 # Votes for a curve that make it sure, in those of a look that is just sure by itself.
-_ENOUGH, _HOPELESS = 1.5, 0.01
-# What the doubts that no look has settled leave of a curve that is sure, and how far apart two doubts
-# about one place are, along the curve.
-_TOGETHER = 0.6
-_SAME_PLACE = 0.05
+_ENOUGH = 1.5
 # And those that the look by which another curve was voted down has to have more.
 _PLENTY = 3.0
+# Votes below which it is not worth looking from.
+_HOPELESS = 0.01
+# What the doubts that no look has settled leave of a curve that is sure, and how far apart two doubts
+# about one place are, along the curve.
+_TOGETHER, _SAME_PLACE = 0.6, 0.05
 # Two looks see the same if they are nowhere further apart, and another thing if they are somewhere.
 _SAME_PX, _OTHER_PX = 5.0, 15.0
 # How much the thread has to bend between two looks that both count.
@@ -80,7 +81,7 @@ class Sureness:
     def revoke(self, now_ns: int) -> None:
         """Makes what was sure open again: looks have to tell."""
         if self.is_sure:
-            self.is_sure, self._votes = False, 0.0
+            self.is_sure, self._votes = False, _HOPELESS
             self._evidence, self._doubts = 0.0, None
             self._looks, self._last_ns = 0, now_ns
 
