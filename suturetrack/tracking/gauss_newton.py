@@ -33,8 +33,9 @@ _HIDDEN_DRIFT_PX = 3.0
 # and in depth, against its errors around.
 _CROWDED_WORTH, _CROWDED_HOLD = 0.02, 0.3
 _LEAST_SURPRISE_PX, _SMOOTH = 0.3, 9
-# Share of its second derivatives that the curve is asked to keep where the prediction holds.
-_KEPT = 0.95
+# Share of its second derivatives that the curve is asked to keep where the prediction holds, and the
+# surprise from which on it does not.
+_KEPT, _FAILED_PX = 0.95, 0.6
 # A first search does not know the thread's direction yet where it has bent.
 _LENIENCY = 0.4
 _EVEN = 150.0
@@ -285,7 +286,7 @@ class _Linearized:
         speed = reference.speed
         bending = config.smoothing * self.samples.share / (self._per_unit * speed**3)
         stretch = self._amounts[0] / (config.stretch * speed) ** 2 / _EVEN**2
-        kept = np.where(self._hidden, 1.0, _KEPT / (1 + surprise**2))
+        kept = np.where(self._hidden, 1.0, _KEPT / (1 + (surprise / _FAILED_PX) ** 4))
         goal = kept[:, None] * reference.second - self.second
         return rows.shape_rows(self.first, goal, bending, stretch)
 
