@@ -246,7 +246,7 @@ def test_what_a_tool_has_swept_over_is_taken_up_as_a_whole(rig: StereoRig) -> No
 def test_an_end_that_was_given_up_may_come_back(rig: StereoRig) -> None:
     """What is left was taken for the whole thread by then, and is longer again."""
     hidden = range(30, 100)
-    truths = [thread(3 * np.clip(i - hidden.start, 0, 20) / FPS) for i in range(125)]
+    truths = [thread(3.8 * np.clip(i - hidden.start, 0, 20) / FPS) for i in range(125)]
     fields = [
         paint(rig, [points[:552] if i in hidden else points], i) for i, points in enumerate(truths)
     ]
