@@ -88,7 +88,7 @@ def _joining(merged: Merged, entries: list[int], ridges: Ridges) -> list[int]:
     line, tangents = np.concatenate(own), np.concatenate([chain_tangents(s) for s in own])
     strength, tree = ridges.sample(line), cKDTree(line)
     found = []
-    for end in set(range(2 * len(merged.segments))) - set(merged.partner):
+    for end in (e for e in range(2 * len(merged.segments)) if e not in merged.partner):
         segment = merged.segments[end // 2]
         arm = segment[:: -1 if end % 2 else 1][:ARM]
         distance, at = tree.query(arm[0])

@@ -308,7 +308,8 @@ class Follower:
         spare = 1.0 - model.ends.length / length_of(model.curve)
         if spare > 0:
             start, stop = (min(part, spare) for part in doubled_ends(model.curve, self.rig))
-            model.curve = nurbs.part(model.curve, start, 1.0 - stop)
+            if start or stop:
+                model.curve = nurbs.part(model.curve, start, 1.0 - stop)
 
     def _search(self, predicted: Nurbs, field: RidgeField, neighbours: Neighbours) -> Evidence:
         """Looks further away for what was seen before, and now and then for what is hidden."""
