@@ -7,8 +7,8 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
-from suturetrack.tracking import TrackingConfig, gauss_newton
-from suturetrack.tracking.ends import EndStep, EndWatch, end_shift, find_end
+from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
+from suturetrack.tracking.ends import EndStep, EndWatch, doubled_ends, end_shift, find_end
 from suturetrack.tracking.follower import measure_levels
 from suturetrack.types import Nurbs, Seed, Stamp, StereoFrame
 from tests.painting import paint
@@ -142,3 +142,38 @@ def test_an_end_that_steps_off_is_held_where_it_was() -> None:
     assert start == 0.0
     assert stop == pytest.approx(0.0)
     assert watch.seen == (True, False)
+
+
+@pytest.mark.parametrize(("width", "is_fold"), [(0.6, True), (12.0, False)])
+def test_an_end_on_its_own_thread_has_folded_if_it_turned_back_at_once(
+    rig: StereoRig, width: float, is_fold: bool
+) -> None:
+    """A loop as wide as that leads its end back onto the thread, over the last 10 mm."""
+    out = np.c_[np.linspace(0, 50, 200), np.zeros(200)]
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 60)[1:]
+    turn = width / 2 * np.c_[np.cos(angle), 1 + np.sin(angle)] + [50, 0]
+    back = np.linspace(0, 1, 120)[1:, None] * [-30.0, 0.0] + turn[-1]
+    back[:, 1] *= np.clip((back[:, 0] - 30) / 20, 0, 1) ** 2
+    flat = np.concatenate([out, turn, back]) - [25, 0]
+    curve = curve_through(np.c_[flat, np.full(len(flat), 200.0)])
+    free, tail = doubled_ends(curve, rig)
+    assert free.part == 0.0
+    assert tail.part > 0.1
+    assert tail.is_fold == is_fold
+    turned_round = doubled_ends(nurbs.reversed_curve(curve), rig)
+    assert turned_round[0].part == pytest.approx(tail.part, abs=0.02)
+    assert turned_round[0].is_fold == is_fold
+
+
+def test_an_end_that_is_drawn_out_of_a_hole_does_not_fold() -> None:
+    scene = open_scene("pull-through", 190)
+    segmenter, tracker = Segmenter(scene.rig), Tracker(scene.rig)
+    for number in range(180):
+        frame = StereoFrame(Stamp(number, round(number * 1e9 / 30), 0), *scene.render(number))
+        if number == 0:
+            start = Seed("0", pixel=scene.seed_pixel(0))
+            segmenter.learn(frame, start)
+            tracker.seed(start)
+        (state,) = tracker.step(segmenter.step(frame)).states
+        (truth,) = scene.truth(number)
+        assert state.length == pytest.approx(truth.length, rel=0.05)

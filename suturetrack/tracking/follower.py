@@ -303,13 +303,15 @@ class Follower:
         return best, inserted, removed
 
     def _cut_doubled_ends(self) -> None:
-        """Cuts off what has folded, where the curve is too long: a tip may lie on its own thread."""
+        """Cuts off what has folded; a tip may lie on its own thread, where the curve is not too long."""
         model = self.model
-        spare = 1.0 - model.ends.length / length_of(model.curve)
-        if spare > 0:
-            start, stop = (min(part, spare) for part in doubled_ends(model.curve, self.rig))
-            if start or stop:
-                model.curve = nurbs.part(model.curve, start, 1.0 - stop)
+        spare = max(1.0 - model.ends.length / length_of(model.curve), 0.0)
+        start, stop = (
+            tail.part if tail.is_fold else min(tail.part, spare)
+            for tail in doubled_ends(model.curve, self.rig)
+        )
+        if start or stop:
+            model.curve = nurbs.part(model.curve, start, 1.0 - stop)
 
     def _search(self, predicted: Nurbs, field: RidgeField, neighbours: Neighbours) -> Evidence:
         """Looks further away for what was seen before, and now and then for what is hidden."""

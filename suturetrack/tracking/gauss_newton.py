@@ -36,6 +36,8 @@ _LEAST_SURPRISE_PX, _SMOOTH = 0.3, 9
 # Share of its second derivatives that the curve is asked to keep where the prediction holds, and the
 # surprise from which on it does not.
 _KEPT, _FAILED_PX = 0.95, 0.6
+# How far from a free end, which nothing bends, it is asked to keep less.
+_FREE_PX = 20.0
 # A first search does not know the thread's direction yet where it has bent.
 _LENIENCY = 0.4
 _EVEN = 150.0
@@ -280,13 +282,16 @@ class _Linearized:
         """Little change of f'' across and along the tangent: a thread keeps its bends and its speed.
 
         So lengths stay where they were, which tells the depth of stretches along the epipolar lines. Where
-        the prediction has failed, little bending and an even speed are all there is to ask for. No length
-        is: noise in depth only ever adds to it, and a goal taken from the curve would keep what it adds.
+        the prediction has failed, and at the ends, which each field draws out anew, little bending and an
+        even speed are all there is to ask for. No length is: noise in depth only ever adds to it, and a
+        goal taken from the curve would keep what it adds.
         """
         speed = reference.speed
         bending = config.smoothing * self.samples.share / (self._per_unit * speed**3)
         stretch = self._amounts[0] / (config.stretch * speed) ** 2 / _EVEN**2
         kept = np.where(self._hidden, 1.0, _KEPT / (1 + (surprise / _FAILED_PX) ** 4))
+        along = _CORRELATION_PX * np.cumsum(self._amounts[0])
+        kept *= np.clip(np.minimum(along, along[-1] - along) / _FREE_PX, 0.0, 1.0)
         goal = kept[:, None] * reference.second - self.second
         return rows.shape_rows(self.first, goal, bending, stretch)
 
