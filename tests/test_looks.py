@@ -368,10 +368,27 @@ def test_places_that_are_clear_in_one_look_each_are_sure_together(
         assert not sureness.is_sure
         assert not sureness.weigh(look, look.curve)
     assert sureness.is_sure == is_clear_once
-    sureness.revoke(1)
+    sureness.revoke(looks[-1].curve, 1)
     assert not sureness.is_hopeless
     sureness.weigh(looks[0], looks[0].curve)
     assert not sureness.is_sure
+
+
+def look_at(rig: StereoRig, truth: np.ndarray, confidence: float) -> Initialization:
+    found = initialize(paint(rig, [truth], 0), rig, seed_on(rig, truth))
+    return replace(found, confidence=confidence)
+
+
+def test_a_curve_that_was_revoked_is_sure_again_once_it_has_moved(rig: StereoRig) -> None:
+    still, moved = (look_at(rig, thread(time), 0.9) for time in (0.0, 0.6))
+    sureness = Sureness(still, still.curve, 0, rig)
+    sureness.revoke(still.curve, 1)
+    assert not sureness.weigh(still, still.curve)
+    assert not sureness.is_sure
+    assert not Sureness(still, still.curve, 2, rig, sureness).is_sure
+    assert Sureness(moved, moved.curve, 2, rig, sureness).is_sure
+    sureness.weigh(moved, moved.curve)
+    assert sureness.is_sure
 
 
 def test_doubts_run_with_the_curve(rig: StereoRig) -> None:

@@ -47,17 +47,29 @@ class Sureness:
     A place that one look doubts may be clear in another one that finds the same: of each doubt of the
     first look only the least is left that any has there.
 
+    A curve that was sure and is revoked stands accused until it moves: what lies still and is no thread
+    looks the same in every look.
+
     Args:
         found: what the first look found.
         curve: where it is followed.
         now_ns: capture time of the field.
         rig: the cameras.
+        before: how sure it was of what was followed before.
     """
 
-    def __init__(self, found: Initialization, curve: Nurbs, now_ns: int, rig: StereoRig) -> None:
-        self.is_sure = found.confidence >= SURE
-        """Whether the curve that is followed may be called the thread."""
+    def __init__(
+        self,
+        found: Initialization,
+        curve: Nurbs,
+        now_ns: int,
+        rig: StereoRig,
+        before: Sureness | None = None,
+    ) -> None:
         self._rig, self._votes = rig, _votes(found.confidence)
+        self._accused: Float64 | None = None if before is None else before._accused
+        self.is_sure = found.confidence >= SURE and not self._is_accused(curve)
+        """Whether the curve that is followed may be called the thread."""
         self._evidence = _evidence(found)
         self._doubts: PlacedDoubts | None = found.doubts
         self._shape = self._outline(curve)
@@ -78,9 +90,10 @@ class Sureness:
         self._looks, self._last_ns = self._looks + 1, now_ns
         return True
 
-    def revoke(self, now_ns: int) -> None:
+    def revoke(self, curve: Nurbs, now_ns: int) -> None:
         """Makes what was sure open again: looks have to tell."""
         if self.is_sure:
+            self._accused = self._outline(curve)
             self.is_sure, self._votes = False, _HOPELESS
             self._evidence, self._doubts = 0.0, None
             self._looks, self._last_ns = 0, now_ns
@@ -91,6 +104,8 @@ class Sureness:
         places = self._outline(found.curve), self._outline(followed)
         apart = float(np.linalg.norm(places[0] - places[1], axis=2).max())
         agrees = apart < _SAME_PX or self.is_same(found.curve, followed)
+        if agrees and self._is_accused(followed):
+            return False
         if confidence >= SURE and (agrees or apart < _OTHER_PX):
             self.is_sure = True
             return apart >= _SAME_PX
@@ -114,6 +129,13 @@ class Sureness:
         """Whether what was found is what is followed, which may lack a little at its ends."""
         both = zip(self._lines(found), self._lines(followed), strict=True)
         return max(_apart(whole, part) for whole, part in both) < _SAME_PX
+
+    def _is_accused(self, curve: Nurbs) -> bool:
+        """Whether it is a curve that was revoked, and has not moved."""
+        if self._accused is None:
+            return False
+        away = np.linalg.norm(self._outline(curve) - self._accused, axis=2)
+        return bool(away.max() < _SAME_PX)
 
     def _has_bent(self, curve: Nurbs) -> bool:
         """Whether its left image is no more the one that counted last, moved, turned and enlarged."""

@@ -120,7 +120,7 @@ class Thread:
             model.curve, state.seen, field, rig, model.levels, others
         )
         if self._strangers.is_found:
-            self._sureness.revoke(field.stamp.capture_ns)
+            self._sureness.revoke(model.curve, field.stamp.capture_ns)
 
     def _come_to(self, state: ThreadState) -> None:
         """What is not sure to be the thread is not called so."""
@@ -267,6 +267,7 @@ class Thread:
             outcome.pursuit.follower.model.curve,
             state.stamp.capture_ns,
             self._setup.rig,
+            self._sureness,
         )
         self._rest = self._failures = 0
         self._longest = max(self._longest, state.length)
