@@ -100,26 +100,22 @@ def test_an_end_beside_another_ridge_gives_back_what_is_too_much() -> None:
     assert (start, stop) == (0.0, pytest.approx(100 / 101 - 1))
 
 
-@pytest.mark.parametrize(("stays", "grown"), [(True, 104.0), (False, 100.0)])
-def test_a_settled_thread_is_drawn_out_only_while_an_end_stays(stays: bool, grown: float) -> None:
+@pytest.mark.parametrize(("ahead_px", "grown"), [(1.0, 110.0), (4.0, 100.0)])
+def test_a_thread_is_drawn_out_steadily_and_not_in_leaps(ahead_px: float, grown: float) -> None:
     watch, now = settled_watch(100.0)
-    length, mean = 100.0, []
-    for field in range(40):
+    length = 100.0
+    for _ in range(40):
         now += FRAME_NS
-        shown = replace(step_at((100 + 0.1 * field) / length * 400 - 400), stays=False)
-        other = replace(step_at(0.0), stays=stays)
-        length *= 1 + sum(watch.moves(other, shown, length, now))
-        mean.append(length)
-    assert max(mean) == pytest.approx(grown, abs=0.8)
+        length *= 1 + sum(watch.moves(step_at(0.0), step_at(ahead_px), length, now))
+    assert length == pytest.approx(grown, abs=1.0)
 
 
-def test_an_end_that_creeps_on_for_long_is_believed_at_last() -> None:
+def test_an_end_that_insists_for_long_is_believed_at_last() -> None:
     watch, now = settled_watch(100.0)
-    longer, other = (replace(step_at(px), stays=False) for px in (5.0, 0.0))
     moved_s = []
     for _ in range(200):
         now += FRAME_NS
-        if watch.moves(other, longer, 100.0, now)[1] > 2 * PIXEL:
+        if watch.moves(step_at(0.0), step_at(5.0), 100.0, now)[1] > 2 * PIXEL:
             moved_s.append(now * 1e-9)
     assert 4.5 < moved_s[0] - 40 * FRAME_NS * 1e-9 < 5.5
 

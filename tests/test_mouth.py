@@ -58,3 +58,9 @@ def test_an_end_that_comes_free_is_let_go(rig: StereoRig) -> None:
     assert steps[61] == pytest.approx(0.0, abs=0.1)
     assert steps[-1] == -20.0
     assert not mouths[0].is_open
+
+
+def test_a_length_that_one_field_shows_opens_no_mouth(rig: StereoRig) -> None:
+    stops = [*[20.0] * 60, 26.0, *[20.0] * 60]
+    _, mouths = follow(rig, stops, [0.0] * len(stops))
+    assert not any(mouth.is_open for mouth in mouths)

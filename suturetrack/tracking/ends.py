@@ -19,6 +19,8 @@ _AT_THE_END = 0.43
 # longer behind an end at something dark, and so much is taken back at most.
 _BEFORE, _BEHIND, _SYMMETRY = 0.7, 0.15, 1.12
 _SOFTEST_PX = 2.0
+# An end that points along the line of sight is taken to be foreshortened to this part of the rest, at most.
+_FORESHORTENED = 0.5
 # Responses below this part of a clear view are background.
 _FAINT = 0.2
 # An end that a view shows further away than this from the curve's own is another one, or covered.
@@ -43,8 +45,6 @@ class EndStep:
     """Whether the image's border cuts the thread."""
     alone: bool = True
     """Whether no other ridge runs beside the end, which it could run on along."""
-    stays: bool = True
-    """Whether the end has kept its place, as where the thread is drawn out of something."""
 
     @property
     def offset(self) -> float:
@@ -183,12 +183,13 @@ def _crossing(x: Float64, mean: Float64, last: int, level: float) -> float:
 
 # What the length of a thread may change by from one field to the next.
 _DRAWN_PX = 6.0
+# A thread is drawn out steadily: an end that leaps on by more than this has met a tool. It makes the thread
+# longer than it ever was by no more than that, until it has insisted for so long.
+_LEAP_PX, _LONGER_PX, _INSISTS_S = 2.5, 1.5, 5.0
 # An end that is hidden steps off by at least this much before the curve's own.
 _CUT_PX = 3.0
 _SETTLING_S = 0.3
 _HELD_S = 1.5
-# How long a thread does not grow beyond a length of its own if neither end keeps its place.
-_KEPT_S = 5.0
 # A length that has kept within this part for so long is the thread's own.
 _STEADY = 0.015
 _SETTLED_S = 0.7
@@ -202,9 +203,8 @@ class EndWatch:
     What one end loses and the other gains is the thread sliding along itself. A thread that is
     suddenly shorter at an end is hidden there, one that is suddenly longer than it ever was has met
     something that looks like it: its length is then held for a while, the more firmly the longer it
-    was steady. A thread that has a length of its own is drawn out only while an end stays, and not where
-    both move: there one creeps on along a tool. An end beside which another ridge runs makes good what
-    is lacking, and gives back what is too much.
+    was steady. An end beside which another ridge runs makes good what is lacking, and gives back what
+    is too much.
     """
 
     def __init__(self, length: float, now_ns: int) -> None:
@@ -265,25 +265,20 @@ class EndWatch:
         if (now_ns - self._found_ns) * _NS < _SETTLING_S:
             return []
         unseen_s = [(now_ns - seen_ns) * _NS for seen_ns in self._seen_ns]
-        slack = _DRAWN_PX * max(step.pixel for step in shown) * length
+        pixel = max(step.pixel for step in shown) * length
         total = length * (1.0 + sum(offsets))
         longer = int(np.argmax(offsets))
-        stays = any(step.stays for step in shown)
-        if not stays and self._has_grown(total, slack / 2) and unseen_s[longer] < _KEPT_S:
+        leaps = shown[longer].offset_px > _LEAP_PX and unseen_s[longer] < _INSISTS_S
+        longest = max(self.length, self._longest)
+        if total > longest + (_LONGER_PX if leaps else _DRAWN_PX) * pixel:
             return [longer]
-        if total > max(self.length, self._longest) + slack:
-            return [longer]
-        if total < self.length - slack:
+        if total < self.length - _DRAWN_PX * pixel:
             doubted = [
                 end
                 for end, step in enumerate(shown)
                 if step.offset_px < -_CUT_PX and offsets[end] <= min(offsets) / 2
             ]
         return [end for end in doubted if unseen_s[end] < _HELD_S]
-
-    def _has_grown(self, total: float, slack: float) -> bool:
-        """Whether a total length is more than the thread's own, where that is known."""
-        return self.settled and not self.at_border and total > self._steady + slack
 
     def _remember(self, length: float, now_ns: int) -> None:
         if abs(length / self._steady - 1) > _STEADY:
@@ -344,9 +339,11 @@ def _doubled(back: Float64, along: Float64) -> tuple[int, bool]:
 
 
 def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:
-    s = np.array([0.02, 0.0]) if end == 0 else np.array([0.98, 1.0])
+    s = np.linspace(0, 1, 51)
     both = views(rig, values_at(curve, s), values_at(curve, s, 1))
-    return max(float(np.mean([view.speed.mean() for view in both])), 1e-6)
+    speed = np.mean([view.speed for view in both], axis=0)
+    at_end = speed[-2:].mean() if end else speed[:2].mean()
+    return max(float(at_end), _FORESHORTENED * float(speed.mean()), 1e-6)
 
 
 def _extension(curve: Nurbs, end: int, beyond: Float64) -> tuple[Float64, Float64]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from suturetrack.camera import StereoRig
@@ -12,9 +10,10 @@ from suturetrack.tracking.sampling import length_of, values_at
 from suturetrack.types import Float64, Nurbs
 
 # An end is at a mouth when it has stayed within this for so long while the thread became longer by so many
-# px and such a part, more than errors in depth make of a length. A knot that is drawn tight makes it shorter.
+# px and such a part, more than errors in depth make of a length, and has been so long for a moment. A knot
+# that is drawn tight makes it shorter.
 _STAYS_PX, _STAYS_NS = 8.0, 500_000_000
-_DRAWN_PX, _DRAWN = 10.0, 0.04
+_DRAWN_PX, _DRAWN, _DRAWN_NS = 10.0, 0.04, 150_000_000
 # It has left one when it was further away, or not to be seen, for so long.
 _LEAVES_PX, _LEAVES_NS = 12.0, 400_000_000
 # An end that jumps has not been drawn out; a mouth draws an end by no more at a time.
@@ -36,7 +35,7 @@ class Mouth:
         self.since_ns = 0
         """When the end came to its place."""
         self._place: Float64 | None = None
-        self._near_ns = 0
+        self._near_ns = self._short_ns = 0
         self._count = 0
         self._length = 0.0
         self._pixel = 0.0
@@ -50,8 +49,7 @@ class Mouth:
         rig: StereoRig,
         now_ns: int,
     ) -> EndStep | None:
-        """The step to the mouth, where the end `end` (0 or 1) of the curve is at one; else the step, and
-        whether the end stays.
+        """The step to the mouth, where the end `end` (0 or 1) of the curve is at one; else the step.
 
         The `other` end must have moved meanwhile: where one of two lies still, that is the mouth.
         """
@@ -64,7 +62,7 @@ class Mouth:
         elif not self.is_open or now_ns - self._near_ns > _LEAVES_NS:
             self.is_open, self._place = False, None
         if not self.is_open or self._place is None:
-            return step and replace(step, stays=now_ns - self.since_ns > _STAYS_NS)
+            return step
         offset_px = float(np.sum((self._place - tip) * outward)) / self._pixel
         offset_px = min(max(offset_px, -_CALM_PX), _CALM_PX)
         return EndStep(offset_px, self._pixel / length, at_border=False)
@@ -88,9 +86,10 @@ class Mouth:
             self._count += 1
             self._place = self._place + (shown - self._place) * max(1 / self._count, _NEWEST)
         has_stayed = now_ns - self.since_ns > _STAYS_NS and abs(step.offset_px) < _CALM_PX
+        if length - self._length <= max(_DRAWN_PX * self._pixel, _DRAWN * self._length):
+            self._short_ns = now_ns
         if has_stayed and other.since_ns > self.since_ns:
-            drawn_out = length - self._length
-            self.is_open |= drawn_out > max(_DRAWN_PX * self._pixel, _DRAWN * self._length)
+            self.is_open |= now_ns - self._short_ns > _DRAWN_NS
 
     def _away(self, shown: Float64, rig: StereoRig) -> float:
         """How far from the mean place the end shows, px: the images tell little of its depth."""
