@@ -8,7 +8,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
-from suturetrack.tracking.sampling import Samples, View, values_at, views
+from suturetrack.tracking.sampling import View, values_at, views
 from suturetrack.types import Float64, Nurbs, RidgeField
 
 _STEP_PX = 0.5
@@ -27,10 +27,6 @@ _FAINT = 0.2
 _SHOWN_PX = 3.0
 # What is shorter than this is a speck behind the end and not its continuation.
 _SOLID_PX = 8.0
-# A curve lies on a part of itself that is so near and so parallel, and so far away along it; so many
-# samples in a row may lie elsewhere. What comes back at once has folded.
-_ON_PX, _PARALLEL, _TURN_PX, _STRAY = 2.0, 0.9, 25.0, 2
-_FOLD_PX = 40.0
 
 
 @dataclass(frozen=True)
@@ -289,53 +285,6 @@ class EndWatch:
         if not self.at_border:
             fading = np.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)
             self._longest = max(length, length + (self._longest - length) * float(fading))
-
-
-@dataclass(frozen=True)
-class Tail:
-    """An end of the curve that lies on another part of it."""
-
-    part: float
-    """Its part of the curve."""
-    is_fold: bool
-    """Whether the curve turns back on the spot: no thread bends so tightly."""
-
-
-def doubled_ends(curve: Nurbs, rig: StereoRig) -> tuple[Tail, Tail]:
-    """What at the start and at the stop of the curve lies on another part of it.
-
-    Strands that cross are not parallel, and strands side by side are further apart.
-    """
-    samples = Samples.of(curve.knots, 4)
-    both = views(rig, samples.values(curve.control_points), samples.values(curve.control_points, 1))
-    along = np.cumsum(samples.share * both[0].speed)
-    pixels = np.stack([view.pixels for view in both])
-    tangents = np.stack([view.tangents for view in both])
-    gap = np.abs(along - along[:, None])
-    near = (np.abs(pixels[:, :, None] - pixels[:, None]) <= _ON_PX).all(axis=(0, 3))
-    parallel = np.abs(tangents @ tangents.transpose(0, 2, 1)).min(axis=0) > _PARALLEL
-    back = np.where(near & parallel & (gap >= _TURN_PX), gap, np.inf).min(axis=1)
-    start, is_fold = _doubled(back, along)
-    stop, is_folded_stop = _doubled(back[::-1], along[-1] - along[::-1])
-    s = samples.s
-    return (
-        Tail(float(s[start]) if start else 0.0, is_fold),
-        Tail(1.0 - float(s[-1 - stop]) if stop else 0.0, is_folded_stop),
-    )
-
-
-def _doubled(back: Float64, along: Float64) -> tuple[int, bool]:
-    """How many of the first samples lie on later ones, `back` px further on, and whether by a fold."""
-    flags = np.flatnonzero(np.isfinite(back))
-    last = -1
-    for j in flags:
-        if j - last > _STRAY + 1:
-            break
-        last = int(j)
-    count = last + 1
-    if count == 0 or count >= len(along) // 2 or along[count] <= _SOLID_PX:
-        return 0, False
-    return count, bool(back[last] < _FOLD_PX)
 
 
 def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:

@@ -14,8 +14,9 @@ from suturetrack.tracking import gauss_newton, paper
 from suturetrack.tracking.alignment import shifted, shown
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange
-from suturetrack.tracking.ends import EndStep, EndWatch, doubled_ends, find_end
+from suturetrack.tracking.ends import EndStep, EndWatch, find_end
 from suturetrack.tracking.energies import energies
+from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.motion import Motion
 from suturetrack.tracking.mouth import Mouth
 from suturetrack.tracking.reliability import (
