@@ -29,6 +29,15 @@ assert client.bus.wait_for_alive("tracker")
 assert steps.get(20) is not None
 print("heard", flush=True)
 """
+WAITER = """
+import threading, time
+from services.client import connect
+def tell():
+    while not any(thread.name == "zenoh" for thread in threading.enumerate()):
+        time.sleep(0.01)
+    print("waits", flush=True)
+threading.Thread(target=tell, daemon=True).start()
+"""
 ENDS = {
     "": (0, ""),
     "raise ValueError('my own')": (1, "ValueError: my own"),
@@ -87,10 +96,9 @@ def test_a_program_is_interrupted_while_it_waits_for_a_router(tmp_path: Path) ->
         '{mode: "client", scouting: {multicast: {enabled: false}},'
         ' connect: {endpoints: ["tcp/127.0.0.1:9"], timeout_ms: -1, exit_on_failure: false}}'
     )
-    code = "from services.client import connect; print('begins', flush=True); "
-    with start(f"{code}connect(zenoh={str(router)!r}); print('connected')") as program:
+    with start(f"{WAITER}connect(zenoh={str(router)!r}); print('connected')") as program:
         assert program.stdout
-        assert program.stdout.readline() == "begins\n"
+        assert program.stdout.readline() == "waits\n"
         program.send_signal(signal.SIGINT)
         try:
             out, err = program.communicate(timeout=SOON_S)
