@@ -38,10 +38,18 @@ def doubled_ends(curve: Nurbs, rig: StereoRig) -> tuple[Tail, Tail]:
     along = np.cumsum(samples.share * both[0].speed)
     pixels = np.stack([view.pixels for view in both])
     tangents = np.stack([view.tangents for view in both])
-    gap = np.abs(along - along[:, None])
-    near = (np.abs(pixels[:, :, None] - pixels[:, None]) <= _ON_PX).all(axis=(0, 3))
-    parallel = np.abs(tangents @ tangents.transpose(0, 2, 1)).min(axis=0) > _PARALLEL
-    back = np.where(near & parallel & (gap >= _TURN_PX), gap, np.inf).min(axis=1)
+
+    def back_at(rows: slice) -> Float64:
+        """(r,) px along the curve from samples to the nearest one that they lie on; inf for none."""
+        gap = np.abs(along - along[rows, None])
+        near = (np.abs(pixels[:, rows, None] - pixels[:, None]) <= _ON_PX).all(axis=(0, 3))
+        parallel = np.abs(tangents[:, rows] @ tangents.transpose(0, 2, 1)).min(axis=0) > _PARALLEL
+        return np.where(near & parallel & (gap >= _TURN_PX), gap, np.inf).min(axis=1)
+
+    tips = slice(None, _STRAY + 1), slice(-_STRAY - 1, None)
+    if not any(np.isfinite(back_at(rows)).any() for rows in tips):
+        return Tail(0.0, False), Tail(0.0, False)
+    back = back_at(slice(None))
     start, is_fold = _doubled(back, along)
     stop, is_folded_stop = _doubled(back[::-1], along[-1] - along[::-1])
     s = samples.s
