@@ -179,8 +179,8 @@ def _crossing(x: Float64, mean: Float64, last: int, level: float) -> float:
 
 # What the length of a thread may change by from one field to the next.
 _DRAWN_PX = 6.0
-# A thread is drawn out steadily: an end that leaps on by more than this has met a tool. It makes the thread
-# longer than it ever was by no more than that, until it has insisted for so long.
+# A thread is drawn out steadily: an end that leaps on by more than the first has met a tool. It makes the
+# thread longer than it ever was by no more than the second, until it has insisted for so long.
 _LEAP_PX, _LONGER_PX, _INSISTS_S = 2.5, 1.5, 5.0
 # An end that is hidden steps off by at least this much before the curve's own.
 _CUT_PX = 3.0
@@ -199,8 +199,9 @@ class EndWatch:
     What one end loses and the other gains is the thread sliding along itself. A thread that is
     suddenly shorter at an end is hidden there, one that is suddenly longer than it ever was has met
     something that looks like it: its length is then held for a while, the more firmly the longer it
-    was steady. An end beside which another ridge runs makes good what is lacking, and gives back what
-    is too much.
+    was steady. An end that leaps on without growing so much is held as well, for fear of a tool that
+    it runs on along. An end beside which another ridge runs makes good what is lacking, and gives back
+    what is too much.
     """
 
     def __init__(self, length: float, now_ns: int) -> None:

@@ -61,9 +61,8 @@ def doubled_ends(curve: Nurbs, rig: StereoRig) -> tuple[Tail, Tail]:
 
 def _doubled(back: Float64, along: Float64) -> tuple[int, bool]:
     """How many of the first samples lie on later ones, `back` px further on, and whether by a fold."""
-    flags = np.flatnonzero(np.isfinite(back))
     last = -1
-    for j in flags:
+    for j in np.flatnonzero(np.isfinite(back)):
         if j - last > _STRAY + 1:
             break
         last = int(j)
