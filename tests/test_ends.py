@@ -111,14 +111,39 @@ def test_a_thread_is_drawn_out_steadily_and_not_in_leaps(ahead_px: float, grown:
     assert length == pytest.approx(grown, abs=1.0)
 
 
-def test_an_end_that_insists_for_long_is_believed_at_last() -> None:
+@pytest.mark.parametrize("ahead_px", [5.0, 10.0])
+def test_an_end_that_insists_for_long_is_believed_at_last(ahead_px: float) -> None:
     watch, now = settled_watch(100.0)
     moved_s = []
     for _ in range(200):
         now += FRAME_NS
-        if watch.moves(step_at(0.0), step_at(5.0), 100.0, now)[1] > 2 * PIXEL:
+        if watch.moves(step_at(0.0), step_at(ahead_px), 100.0, now)[1] > 2 * PIXEL:
             moved_s.append(now * 1e-9)
     assert 4.5 < moved_s[0] - 40 * FRAME_NS * 1e-9 < 5.5
+
+
+@pytest.mark.parametrize("ahead_px", [5.0, 10.0])
+def test_a_thread_of_unknown_length_is_soon_drawn_out_in_leaps(ahead_px: float) -> None:
+    """What was hidden when the thread was found comes out from behind it at once."""
+    watch, now, grown_s = EndWatch(100.0, 0), 0, []
+    for _ in range(100):
+        now += FRAME_NS
+        is_hidden = now < 0.5e9
+        step = step_at(0.0 if is_hidden else ahead_px)
+        if watch.moves(step_at(0.0), step, 100.0, now)[1] > 2 * PIXEL:
+            grown_s.append(now * 1e-9)
+    assert 0.7 < grown_s[0] < 0.9
+
+
+@pytest.mark.parametrize("ahead_px", [5.0, 10.0])
+def test_a_held_end_does_not_settle_the_length(ahead_px: float) -> None:
+    watch, now = EndWatch(100.0, 0), 0
+    for number in range(45):
+        now += FRAME_NS
+        is_hidden = now < 0.4e9 or number % 5 == 0
+        step = step_at(0.0 if is_hidden else ahead_px)
+        assert watch.moves(step_at(0.0), step, 100.0, now) == (0.0, 0.0)
+    assert not watch.settled
 
 
 def test_a_loop_that_is_drawn_shut_moves_no_end() -> None:
@@ -160,6 +185,33 @@ def test_an_end_on_its_own_thread_has_folded_if_it_turned_back_at_once(
     turned_round = doubled_ends(nurbs.reversed_curve(curve), rig)
     assert turned_round[0].part == pytest.approx(tail.part, abs=0.02)
     assert turned_round[0].is_fold == is_fold
+
+
+@pytest.mark.parametrize(
+    ("back_mm", "width", "cut"), [(1.5, 0.2, 1.5), (3.0, 0.2, 3.0), (3.0, 2.0, 0.0)]
+)
+def test_a_tip_that_has_begun_to_fold_is_cut_off_at_the_turn(
+    rig: StereoRig, back_mm: float, width: float, cut: float
+) -> None:
+    """A tip that runs back beside the thread at a distance `width`; a hook is wider than a fold."""
+    out = np.c_[np.linspace(0, 50, 400), np.zeros(400)]
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 30)[1:]
+    turn = width / 2 * np.c_[np.cos(angle), 1 + np.sin(angle)] + [50, 0]
+    back = np.linspace(0, 1, 30)[1:, None] * [-back_mm, 0.0] + turn[-1]
+    flat = np.concatenate([out, turn, back]) - [25, 0]
+    points = np.c_[flat, np.full(len(flat), 200.0)]
+    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    s = travelled / travelled[-1]
+    knots = nurbs.clamped_knots(
+        np.r_[np.linspace(0, 0.9, 12)[1:], np.linspace(0.9, 1, 21)[1:-1]], 3
+    )
+    curve = nurbs.fit(points, s, knots, 3)
+    free, tail = doubled_ends(curve, rig)
+    assert free.part == 0.0
+    assert tail.is_fold == (cut > 0.0)
+    assert tail.part * travelled[-1] == pytest.approx(cut, abs=0.5)
+    turned_round, _ = doubled_ends(nurbs.reversed_curve(curve), rig)
+    assert turned_round.part == pytest.approx(tail.part, abs=0.01)
 
 
 def test_an_end_that_is_drawn_out_of_a_hole_does_not_fold() -> None:

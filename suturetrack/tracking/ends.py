@@ -180,7 +180,8 @@ def _crossing(x: Float64, mean: Float64, last: int, level: float) -> float:
 # What the length of a thread may change by from one field to the next.
 _DRAWN_PX = 6.0
 # A thread is drawn out steadily: an end that leaps on by more than the first has met a tool. It makes the
-# thread longer than it ever was by no more than the second, until it has insisted for so long.
+# thread longer than it ever was by no more than the second, until it has insisted for so long where the
+# length is known.
 _LEAP_PX, _LONGER_PX, _INSISTS_S = 2.5, 1.5, 5.0
 # An end that is hidden steps off by at least this much before the curve's own.
 _CUT_PX = 3.0
@@ -200,7 +201,8 @@ class EndWatch:
     suddenly shorter at an end is hidden there, one that is suddenly longer than it ever was has met
     something that looks like it: its length is then held for a while, the more firmly the longer it
     was steady. An end that leaps on without growing so much is held as well, for fear of a tool that
-    it runs on along. An end beside which another ridge runs makes good what is lacking, and gives back
+    it runs on along; not for long, while the length has never been steady: then something has come
+    out of hiding. An end beside which another ridge runs makes good what is lacking, and gives back
     what is too much.
     """
 
@@ -210,6 +212,7 @@ class EndWatch:
         self._seen_ns = [now_ns, now_ns]
         self._steady_ns = now_ns
         self.length = self._longest = self._steady = length
+        self._is_known = False
         self.settled = False
         """Whether the length has been steady for long enough to be the thread's own."""
         self.wanted = length
@@ -219,9 +222,19 @@ class EndWatch:
         """Whether the image's border cuts the thread."""
 
     def moves(
-        self, start: EndStep | None, stop: EndStep | None, length: float, now_ns: int
+        self,
+        start: EndStep | None,
+        stop: EndStep | None,
+        length: float,
+        now_ns: int,
+        *,
+        is_known: bool = False,
     ) -> tuple[float, float]:
-        """How far to move both ends outward, as parts of the curve's `length`."""
+        """How far to move both ends outward, as parts of the curve's `length`.
+
+        `is_known` says that the thread's length has settled once, before this watch began.
+        """
+        self._is_known |= is_known
         steps = start, stop
         offsets = [step.offset if step else 0.0 for step in steps]
         self.wanted = length * (1.0 + sum(offsets))
@@ -242,7 +255,9 @@ class EndWatch:
                 self._seen_ns[end] = now_ns
         self.seen = seen[0], seen[1]
         self.at_border = any(step and step.at_border for step in steps)
-        if not doubted:
+        if doubted:
+            self._steady_ns += now_ns - self._last_ns
+        else:
             self._remember(length * (1.0 + sum(offsets)), now_ns)
         self._last_ns = now_ns
         return offsets[0], offsets[1]
@@ -265,9 +280,9 @@ class EndWatch:
         pixel = max(step.pixel for step in shown) * length
         total = length * (1.0 + sum(offsets))
         longer = int(np.argmax(offsets))
-        leaps = shown[longer].offset_px > _LEAP_PX and unseen_s[longer] < _INSISTS_S
-        longest = max(self.length, self._longest)
-        if total > longest + (_LONGER_PX if leaps else _DRAWN_PX) * pixel:
+        insisted = unseen_s[longer] >= (_INSISTS_S if self._is_known else _SETTLING_S)
+        growth = _LONGER_PX if shown[longer].offset_px > _LEAP_PX else _DRAWN_PX
+        if not insisted and total > max(self.length, self._longest) + growth * pixel:
             return [longer]
         if total < self.length - _DRAWN_PX * pixel:
             doubted = [
@@ -282,6 +297,7 @@ class EndWatch:
             self._steady, self._steady_ns = length, now_ns
         self._steady += 0.02 * (length - self._steady)
         self.settled = (now_ns - self._steady_ns) * _NS > _SETTLED_S
+        self._is_known |= self.settled
         self.length = self._steady if self.settled else length
         if not self.at_border:
             fading = np.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.tracking.sampling import Samples, views
-from suturetrack.types import Float64, Nurbs
+from suturetrack.tracking.sampling import Samples, View, values_at, views
+from suturetrack.types import Bool, Float64, Nurbs
 
 # A curve lies on a part of itself that is so near and so parallel, and so far away along it; so many
 # samples in a row may lie elsewhere. What comes back at once has folded.
@@ -16,6 +16,8 @@ _ON_PX, _PARALLEL, _TURN_PX, _STRAY = 2.0, 0.9, 25.0, 2
 _FOLD_PX = 40.0
 # What is shorter than this may be noise.
 _SHORTEST_PX = 8.0
+# A tip that has just begun to fold runs back over so many of its pixels, at this cosine to its way there.
+_TIP, _OPPOSED = 6, -0.7
 
 
 @dataclass(frozen=True)
@@ -36,14 +38,33 @@ def doubled_ends(curve: Nurbs, rig: StereoRig) -> tuple[Tail, Tail]:
     samples = Samples.of(curve.knots, 4)
     both = views(rig, samples.values(curve.control_points), samples.values(curve.control_points, 1))
     along = np.cumsum(samples.share * both[0].speed)
-    pixels = np.stack([view.pixels for view in both])
-    tangents = np.stack([view.tangents for view in both])
+    inward = np.arange(0.0, min(_FOLD_PX, along[-1] / 2))
+    start = _turn(curve, rig, np.interp(inward, along, samples.s))
+    stop = 1.0 - _turn(curve, rig, np.interp(along[-1] - inward, along, samples.s))
+    tails = _long_tails(samples, both, along)
+    return Tail(start, True) if start else tails[0], Tail(stop, True) if stop else tails[1]
+
+
+def _turn(curve: Nurbs, rig: StereoRig, inward: Float64) -> float:
+    """Where the tip turns back, of parameters a pixel apart that begin at an end; that end if it does
+    not."""
+    near, cosines = _compared(
+        views(rig, values_at(curve, inward), values_at(curve, inward, 1)), slice(_TIP)
+    )
+    tip, there = np.nonzero(near & (cosines.max(axis=0) < _OPPOSED))
+    if not len(tip):
+        return round(float(inward[0]))
+    return float(inward[(tip + there).max() // 2])
+
+
+def _long_tails(samples: Samples, both: tuple[View, View], along: Float64) -> tuple[Tail, Tail]:
+    """The ends that lie on the curve further on, `along` px from its start."""
 
     def back_at(rows: slice) -> Float64:
         """(r,) px along the curve from samples to the nearest one that they lie on; inf for none."""
         gap = np.abs(along - along[rows, None])
-        near = (np.abs(pixels[:, rows, None] - pixels[:, None]) <= _ON_PX).all(axis=(0, 3))
-        parallel = np.abs(tangents[:, rows] @ tangents.transpose(0, 2, 1)).min(axis=0) > _PARALLEL
+        near, cosines = _compared(both, rows)
+        parallel = np.abs(cosines).min(axis=0) > _PARALLEL
         return np.where(near & parallel & (gap >= _TURN_PX), gap, np.inf).min(axis=1)
 
     tips = slice(None, _STRAY + 1), slice(-_STRAY - 1, None)
@@ -57,6 +78,14 @@ def doubled_ends(curve: Nurbs, rig: StereoRig) -> tuple[Tail, Tail]:
         Tail(float(s[start]) if start else 0.0, is_fold),
         Tail(1.0 - float(s[-1 - stop]) if stop else 0.0, is_folded_stop),
     )
+
+
+def _compared(both: tuple[View, View], rows: slice) -> tuple[Bool, Float64]:
+    """(r, k) whether the samples `rows` lie on others in both images, and (2, r, k) cosines to them."""
+    pixels = np.stack([view.pixels for view in both])
+    tangents = np.stack([view.tangents for view in both])
+    apart = np.abs(pixels[:, rows, None] - pixels[:, None]).max(axis=(0, 3))
+    return apart <= _ON_PX, tangents[:, rows] @ tangents.transpose(0, 2, 1)
 
 
 def _doubled(back: Float64, along: Float64) -> tuple[int, bool]:

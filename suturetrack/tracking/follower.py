@@ -345,7 +345,11 @@ class Follower:
         tips = crowded[:_TIP], crowded[-_TIP:]
         steps = [self._end_step(end, field, alone=not tips[end].any()) for end in (0, 1)]
         start, stop = model.ends.moves(
-            steps[0], steps[1], length_of(model.curve), field.stamp.capture_ns
+            steps[0],
+            steps[1],
+            length_of(model.curve),
+            field.stamp.capture_ns,
+            is_known=self._established,
         )
         if start or stop:
             model.curve = _with_ends(model.curve, -start, 1.0 + stop)
