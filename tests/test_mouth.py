@@ -64,3 +64,18 @@ def test_a_length_that_one_field_shows_opens_no_mouth(rig: StereoRig) -> None:
     stops = [*[20.0] * 60, 26.0, *[20.0] * 60]
     _, mouths = follow(rig, stops, [0.0] * len(stops))
     assert not any(mouth.is_open for mouth in mouths)
+
+
+def test_a_mouth_is_met_in_the_images_where_the_depth_of_the_end_is_in_doubt(
+    rig: StereoRig,
+) -> None:
+    _, mouths = follow(rig, list(np.linspace(20, 60, 60)), [0.0] * 60)
+    assert mouths[0].is_open
+    middle = np.array([rig.baseline / 2, 0.0, 0.0])
+    deeper = middle + (HOLE - middle) * (1 + 8.0 / HOLE[2])
+    points = deeper + np.linspace(0, 1, 4)[:, None] * (np.array([60.0, 0.0, HOLE[2]]) - deeper)
+    tilted = nurbs.curve_from(3, nurbs.clamped_knots(np.zeros(0), 3), points)
+    step = EndStep(0.0, 0.25 / nurbs.length(tilted), at_border=False)
+    found = mouths[0].steady(step, tilted, 0, mouths[1], rig, 60 * FIELD_NS)
+    assert found is not None
+    assert abs(found.offset_px) < 0.3

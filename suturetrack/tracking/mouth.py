@@ -6,7 +6,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.tracking.ends import EndStep
-from suturetrack.tracking.sampling import length_of, values_at
+from suturetrack.tracking.sampling import length_of, values_at, views
 from suturetrack.types import Float64, Nurbs
 
 # An end is at a mouth when it has stayed within this for so long while the thread became longer by so many
@@ -63,7 +63,7 @@ class Mouth:
             self.is_open, self._place = False, None
         if not self.is_open or self._place is None:
             return step
-        offset_px = float(np.sum((self._place - tip) * outward)) / self._pixel
+        offset_px = _ahead(self._place, tip, outward, rig)
         offset_px = min(max(offset_px, -_CALM_PX), _CALM_PX)
         return EndStep(offset_px, self._pixel / length, at_border=False)
 
@@ -102,3 +102,9 @@ class Mouth:
         if self.is_open:
             return away > _LEAVES_PX and now_ns - self._near_ns > _LEAVES_NS
         return away > _STAYS_PX
+
+
+def _ahead(place: Float64, tip: Float64, outward: Float64, rig: StereoRig) -> float:
+    """How far a place lies ahead of the tip in the images, px: the depth of both is unsure."""
+    both = zip(views(rig, tip, outward), rig.project(place), strict=True)
+    return float(np.mean([np.sum((there - v.pixels) * v.tangents) for v, there in both]))
