@@ -123,16 +123,18 @@ def test_an_end_that_insists_for_long_is_believed_at_last(ahead_px: float) -> No
 
 
 @pytest.mark.parametrize("ahead_px", [5.0, 10.0])
-def test_a_thread_of_unknown_length_is_soon_drawn_out_in_leaps(ahead_px: float) -> None:
-    """What was hidden when the thread was found comes out from behind it at once."""
+@pytest.mark.parametrize(("hidden_s", "held_s"), [(0.3, 0.6), (0.6, 1.2)])
+def test_a_thread_of_unknown_length_is_soon_drawn_out_in_leaps(
+    ahead_px: float, hidden_s: float, held_s: float
+) -> None:
+    """What was hidden when the thread was found comes out at once, and insists for twice as long."""
     watch, now, grown_s = EndWatch(100.0, 0), 0, []
     for _ in range(100):
         now += FRAME_NS
-        is_hidden = now < 0.5e9
-        step = step_at(0.0 if is_hidden else ahead_px)
+        step = step_at(0.0 if now < hidden_s * 1e9 else ahead_px)
         if watch.moves(step_at(0.0), step, 100.0, now)[1] > 2 * PIXEL:
             grown_s.append(now * 1e-9)
-    assert 0.7 < grown_s[0] < 0.9
+    assert grown_s[0] - hidden_s == pytest.approx(held_s, abs=0.1)
 
 
 @pytest.mark.parametrize("ahead_px", [5.0, 10.0])

@@ -180,8 +180,8 @@ def _crossing(x: Float64, mean: Float64, last: int, level: float) -> float:
 # What the length of a thread may change by from one field to the next.
 _DRAWN_PX = 6.0
 # A thread is drawn out steadily: an end that leaps on by more than the first has met a tool. It makes the
-# thread longer than it ever was by no more than the second, until it has insisted for so long where the
-# length is known.
+# thread longer than it ever was by no more than the second, until it has insisted for so long; for twice as
+# long as the length was steady, while that is not known.
 _LEAP_PX, _LONGER_PX, _INSISTS_S = 2.5, 1.5, 5.0
 # An end that is hidden steps off by at least this much before the curve's own.
 _CUT_PX = 3.0
@@ -201,8 +201,8 @@ class EndWatch:
     suddenly shorter at an end is hidden there, one that is suddenly longer than it ever was has met
     something that looks like it: its length is then held for a while, the more firmly the longer it
     was steady. An end that leaps on without growing so much is held as well, for fear of a tool that
-    it runs on along; not for long, while the length has never been steady: then something has come
-    out of hiding. An end beside which another ridge runs makes good what is lacking, and gives back
+    it runs on along; not for long where the length was not steady for long, for then something has
+    come out of hiding. An end beside which another ridge runs makes good what is lacking, and gives back
     what is too much.
     """
 
@@ -256,7 +256,7 @@ class EndWatch:
         self.seen = seen[0], seen[1]
         self.at_border = any(step and step.at_border for step in steps)
         if doubted:
-            self._steady_ns += now_ns - self._last_ns
+            self._steady_ns += max(now_ns - self._last_ns, 0)
         else:
             self._remember(length * (1.0 + sum(offsets)), now_ns)
         self._last_ns = now_ns
@@ -280,9 +280,13 @@ class EndWatch:
         pixel = max(step.pixel for step in shown) * length
         total = length * (1.0 + sum(offsets))
         longer = int(np.argmax(offsets))
-        insisted = unseen_s[longer] >= (_INSISTS_S if self._is_known else _SETTLING_S)
+        steady_s = (now_ns - self._steady_ns) * _NS
+        insists_s = _INSISTS_S if self._is_known else max(2 * steady_s, _SETTLING_S)
         growth = _LONGER_PX if shown[longer].offset_px > _LEAP_PX else _DRAWN_PX
-        if not insisted and total > max(self.length, self._longest) + growth * pixel:
+        if (
+            unseen_s[longer] < insists_s
+            and total > max(self.length, self._longest) + growth * pixel
+        ):
             return [longer]
         if total < self.length - _DRAWN_PX * pixel:
             doubted = [
