@@ -39,22 +39,23 @@ def doubled_ends(curve: Nurbs, rig: StereoRig) -> tuple[Tail, Tail]:
     both = views(rig, samples.values(curve.control_points), samples.values(curve.control_points, 1))
     along = np.cumsum(samples.share * both[0].speed)
     inward = np.arange(0.0, min(_FOLD_PX, along[-1] / 2))
-    start = _turn(curve, rig, np.interp(inward, along, samples.s))
-    stop = 1.0 - _turn(curve, rig, np.interp(along[-1] - inward, along, samples.s))
+    start = _fold(curve, rig, 0, np.interp(inward, along, samples.s))
+    stop = _fold(curve, rig, 1, np.interp(along[-1] - inward, along, samples.s))
     tails = _long_tails(samples, both, along)
     return Tail(start, True) if start else tails[0], Tail(stop, True) if stop else tails[1]
 
 
-def _turn(curve: Nurbs, rig: StereoRig, inward: Float64) -> float:
-    """Where the tip turns back, of parameters a pixel apart that begin at an end; that end if it does
-    not."""
-    near, cosines = _compared(
-        views(rig, values_at(curve, inward), values_at(curve, inward, 1)), slice(_TIP)
-    )
+def _fold(curve: Nurbs, rig: StereoRig, end: int, inward: Float64) -> float:
+    """The part of the curve from the end `end` (0 or 1) to where the tip turns back; 0 if it does not.
+
+    `inward` are parameters a pixel apart that begin at that end.
+    """
+    both = views(rig, values_at(curve, inward), values_at(curve, inward, 1))
+    near, cosines = _compared(both, slice(_TIP))
     tip, there = np.nonzero(near & (cosines.max(axis=0) < _OPPOSED))
     if not len(tip):
-        return round(float(inward[0]))
-    return float(inward[(tip + there).max() // 2])
+        return 0.0
+    return abs(end - float(inward[(tip + there).max() // 2]))
 
 
 def _long_tails(samples: Samples, both: tuple[View, View], along: Float64) -> tuple[Tail, Tail]:
