@@ -319,6 +319,33 @@ def test_a_highlight_is_bridged(rig: StereoRig, curve: Nurbs) -> None:
     assert abs(curve_error(dense(found.curve), truth).length_percent) < 2
 
 
+@pytest.mark.parametrize(
+    ("aside", "turned", "nearer", "is_one"),
+    [
+        (0.0, 0.0, 0.0, True),
+        (25.0, 0.0, 0.0, False),
+        (0.0, 1.2, 0.0, False),
+        (0.0, 0.0, 25.0, False),
+    ],
+)
+def test_a_stretch_behind_a_tool_is_bridged_where_both_sides_are_one_strand(
+    rig: StereoRig, aside: float, turned: float, nearer: float, is_one: bool
+) -> None:
+    """Not where they do not point at each other, or lie at different depths."""
+    t, angle = np.linspace(0, 180, 500), 0.8 + turned
+    come = [160 + 180 * 0.7, 120 + 180 * 0.7] - 0.7 * t[::-1, None]
+    gone = [t * np.cos(angle) + t**2 / 900, t * np.sin(angle)]
+    go = come[-1] + [25 - aside, 25 + aside] + np.stack(gone, axis=1)
+    left = draw(go, rig, draw(come, rig))
+    right = draw(go - [40 + nearer, 0], rig, draw(come - [40, 0], rig))
+    found = initialize(field_of(left, right, rig), rig, Seed(pixel=tuple(come[250])))
+    ends = rig.project(dense(found.curve))[0][[0, -1]]
+    reached = go[-1] if is_one else come[-1]
+    assert np.linalg.norm(ends - reached, axis=1).min() < 3
+    assert any("a hidden stretch" in why for why in found.reasons) == is_one
+    assert 0.5 < found.confidence < 0.95 if is_one else True
+
+
 def shining(pixels: Float64, rig: StereoRig, stretch: slice, width: int) -> Image:
     """A thread that is wider along a stretch, and there all highlight but for its rims."""
     image = draw(pixels[stretch], rig, draw(pixels, rig), width=width)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization.doubts import CROSSING, FOREIGN, Doubt
+from suturetrack.initialization.doubts import CROSSING, FADES, FOREIGN, HIDDEN, Doubt
 from suturetrack.initialization.fitting import Samples
 from suturetrack.initialization.growth import Chain
 from suturetrack.initialization.model import PlacedDoubts, remaining
@@ -112,7 +112,7 @@ def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
     """
     kept = []
     for place, why, rest in doubts:
-        if why in FOREIGN:
+        if why in (*FOREIGN, HIDDEN):
             kept.append((place, why, rest))
             continue
         near = np.flatnonzero(np.linalg.norm(line - place, axis=1) <= _SAME_PLACE_PX)
@@ -142,7 +142,7 @@ def _placed(
         both = max(rest, min(_same(why, there, doubts[1 - view]), default=1.0))
         if not _is_shared(place, line, counterpart, chains[1 - view].pixels):
             left = rest
-        elif why in (CROSSING, *FOREIGN) and both < _GRAVE:
+        elif why in (CROSSING, FADES, *FOREIGN) and both < _GRAVE:
             left = both
         else:
             left = float(np.sqrt(rest))

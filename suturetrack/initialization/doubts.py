@@ -19,10 +19,15 @@ JOINED = "another strand that ends on it"
 """Where two strands come and one goes on: it may be the other one."""
 BENT = "a bend as of two strands"
 """Where the thread may end, and another one go on from there."""
+FADES = "a fainter ridge behind an end"
+HIDDEN = "a hidden stretch"
+"""What is seen on both sides of it may be two threads."""
 FOREIGN = JOINED, BENT
 """Whether a part is another thread's: what one view shows as the one, the other may as the other."""
 _FOREIGN = 0.45
 """What such a doubt leaves of the confidence."""
+_HIDDEN = 0.7
+"""What a hidden stretch leaves of it."""
 _REASSURANCE = 0.3
 """Share of its lead over the next best way that the price of a merge is less doubtful by."""
 _STRAIN = 1.5
@@ -57,6 +62,9 @@ def _at_merges(merged: Merged, entries: list[int]) -> list[tuple[int, str, float
     within = within_reach(merged.price)
     found = []
     for entry in entries[1:]:
+        if entry in merged.hidden:
+            found.append((entry, HIDDEN, _HIDDEN))
+            continue
         price = merged.price[entry, merged.partner[entry]]
         lead = min(_lead(merged, entry, entries, within), FREE_END)
         strain = price - _REASSURANCE * lead

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from suturetrack.initialization.depth import Depth
-from suturetrack.initialization.doubts import Doubt, doubts
+from suturetrack.initialization.doubts import FADES, Doubt, doubts
 from suturetrack.initialization.model import InitializationConfig, ViewGrowth
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import follow, merge_ends
@@ -22,7 +22,7 @@ _FALLEN = 0.42
 """Strength, against the rest of the thread, of what goes on behind its end at most."""
 _FALL = 0.5
 """Ratio of the strengths behind and before such an end at most: threads fade more slowly."""
-_FAINTER = 0.6
+_FAINTER = 0.49
 """What such an end leaves of the confidence."""
 _SHORTEST_TAIL = 24
 """Points that go on so, at least: what is shorter may be the thread's own end, in the shade."""
@@ -110,7 +110,7 @@ def without_faint_tails(thread: Thread, place: Float64) -> Thread:
     pixels = chain.pixels[start:stop]
     left = [d for d in chain.doubts if np.linalg.norm(pixels - d[0], axis=1).min() < _WINDOW]
     cut = [end for end, at in ((0, start), (-1, len(strength) - stop)) if at > 0]
-    left += [(pixels[end], "a fainter ridge behind an end", _FAINTER) for end in cut]
+    left += [(pixels[end], FADES, _FAINTER) for end in cut]
     return replace(thread, chain=Chain(pixels, chain.seen[start:stop], tuple(left)))
 
 

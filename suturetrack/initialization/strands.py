@@ -22,6 +22,9 @@ _RIVAL, _CLOSE_RIVAL = 0.5, 0.25
 _BENT = 0.03
 """Price of a unit of the energy by which arms fit together less well."""
 _MOST_BENT = 25.0
+_LEAST_HIDDEN_ARM = 20
+_HIDDEN_PX = 30.0
+"""Length of a hidden stretch that is worth a unit of energy."""
 _DISPARITY_BEND = 1e-4
 _SHAPE_BEND = 3e-5
 """Spectral density of the change of slope in disparity, and of curvature in an image, 1/px."""
@@ -67,6 +70,15 @@ class Strands:
         if i // 2 == j // 2 or min(len(self._arm(i)), len(self._arm(j))) < _LEAST_ARM:
             return 0.0
         return _bend(self._arm(i), self._arm(j))
+
+    def goes_on(self, i: int, j: int) -> float:
+        """Energy by which the arms of two ends are less well one strand, hidden between them, than two:
+        the more, the longer it would be hidden; infinite where one is too short to tell."""
+        one, other = self._arm(i), self._arm(j)
+        if i // 2 == j // 2 or min(len(one), len(other)) < _LEAST_HIDDEN_ARM:
+            return np.inf
+        length = float(np.linalg.norm(other[0] - one[0]))
+        return _bend(one, other) + self._step(i, j) + (length / _HIDDEN_PX) ** 2
 
     def _misfit(self, i: int, j: int) -> float:
         return _BENT * (_bend(self._arm(i), self._arm(j)) + self._step(i, j))

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.model import InitializationConfig
@@ -23,6 +24,11 @@ _CLEARLY = 0.03
 """By how much less two strands have to cost in all if their far parts are swapped."""
 _BENT = 8.0
 """Energy by which two arms fit together less well as one strand than as two."""
+_LONGEST_HIDDEN_PX = 60.0
+_ONE_STRAND = 2.5
+"""Energy up to which two arms with a hidden stretch in between are one strand."""
+_AS_STRONG = 0.5
+"""Ratio of their strengths, at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +43,8 @@ class Merged:
     """Of every pair of ends within reach."""
     bent: frozenset[int]
     """The joined ends whose strands bend there as two would, and not one."""
+    hidden: frozenset[int] = frozenset()
+    """The joined ends of strands that something hides in between."""
 
     def is_copy(self, one: int, other: int) -> bool:
         """Whether two ends are the same one of a segment that strands share."""
@@ -70,7 +78,8 @@ def _merge(ridges: Ridges, merges: Merge, strands: Strands | None) -> Merged:
     segments = _share(ridges.segments, partner, price, strands)
     _open_rings(partner, price)
     _pair(partner, merges.pairs[order[merges.touching[order]]])
-    return Merged(segments, partner, price, _bent(ridges.segments, segments, partner, strands))
+    bent = _bent(ridges.segments, segments, partner, strands)
+    return Merged(segments, partner, price, bent, _bridge_hidden(ridges, partner, price, strands))
 
 
 def _bent(
@@ -84,6 +93,35 @@ def _bent(
     origin = {id(s): k for k, s in enumerate(originals)}
     ends = {e: 2 * origin[id(segments[e // 2])] + e % 2 for e in partner}
     return frozenset(i for i, j in partner.items() if strands.bend(ends[i], ends[j]) > _BENT)
+
+
+def _bridge_hidden(
+    ridges: Ridges,
+    partner: dict[int, int],
+    price: dict[tuple[int, int], float],
+    strands: Strands | None,
+) -> frozenset[int]:
+    """Joins free ends of one strand that something, such as a tool, hides in between; returns them."""
+    free = [end for end in range(2 * len(ridges.segments)) if end not in partner]
+    if strands is None or len(free) < 2:
+        return frozenset()
+    places = np.array([ridges.segments[end // 2][-(end % 2)] for end in free])
+    strength = [float(np.median(ridges.sample(ridges.segments[end // 2]))) for end in free]
+    ways = [
+        (strands.goes_on(free[a], free[b]), free[a], free[b])
+        for a, b in cKDTree(places).query_pairs(_LONGEST_HIDDEN_PX)
+        if _AS_STRONG < strength[a] / strength[b] < 1 / _AS_STRONG
+    ]
+    hidden: set[int] = set()
+    for energy, i, j in sorted(ways):
+        if energy > _ONE_STRAND:
+            break
+        if i not in partner and j not in partner and _leads_to(i, partner) != j:
+            for one, other in ((i, j), (j, i)):
+                partner[one] = other
+                price.setdefault((one, other), FREE_END)
+            hidden |= {i, j}
+    return frozenset(hidden)
 
 
 def _uncross(
