@@ -430,3 +430,37 @@ def test_what_was_followed_for_sure_is_known_again(
     assert states[lost_at - 1].status is Status.TRACKING
     assert any("found again" in state.events for state in states)
     assert states[-1].status is (Status.OCCLUDED if other else Status.TRACKING)
+
+
+def test_what_was_taken_for_the_thread_since_does_not_tell_its_length_alone(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A strand as long as the thread is held in doubt, and grows; the thread is known by its own length."""
+    lost_at, plain_at, step = 6, 50, Follower.step
+    truth = thread(0.0)
+    longer = thread(1.0, 140.0, bend=-0.6) + np.array([0.0, 30.0, 0.0])
+    grown = [longer[: round(600 * np.clip(88 + i, 100, 125) / 140)] for i in range(90)]
+    first: list[Follower] = []
+
+    def lose(self: Follower, field: RidgeField, *args: object) -> ThreadState:
+        state = step(self, field, *args)  # type: ignore[arg-type]
+        first[:] = first or [self]
+        is_lost = self is first[0] and field.stamp.frame >= lost_at
+        return replace(state, status=Status.LOST) if is_lost else state
+
+    def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
+        number = field.stamp.frame
+        is_other = lost_at <= number < plain_at
+        found = initialize(field, rig, seed_on(rig, grown[number] if is_other else truth))
+        return replace(found, confidence=0.3 if is_other else 0.9)
+
+    monkeypatch.setattr(Follower, "step", lose)
+    looks_by(monkeypatch, look)
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, truth))
+    states = [
+        tracker.step(paint(rig, [truth, other], i)).states[0] for i, other in enumerate(grown)
+    ]
+    assert states[plain_at].status is Status.OCCLUDED
+    assert states[plain_at].length == pytest.approx(metrics.polyline_length(grown[-1]), rel=0.01)
+    assert rms(states[-1], truth) < 0.1

@@ -97,9 +97,13 @@ def starts_on(last: Nurbs, seed: Seed, field: RidgeField, rig: StereoRig) -> lis
 
 def has_length(curve: Nurbs, known_lengths: tuple[float, ...]) -> bool:
     """Whether the curve is as long as the thread is known to be; any is where nothing is known."""
+    return not known_lengths or length_error(curve, known_lengths) < _LENGTH_TOLERANCE
+
+
+def length_error(curve: Nurbs, known_lengths: tuple[float, ...]) -> float:
+    """How far the curve's length is from the nearest known one, as a share of that."""
     actual = length(curve)
-    near = [abs(actual / known - 1) < _LENGTH_TOLERANCE for known in known_lengths]
-    return any(near) or not near
+    return min(abs(actual / known - 1) for known in known_lengths)
 
 
 def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:

@@ -13,6 +13,7 @@ from suturetrack.tracking.recovery import (
     directed,
     find_again,
     has_length,
+    length_error,
     lies_on,
     starts_on,
 )
@@ -59,8 +60,8 @@ class Again:
     """What its length has to be one of, if anything."""
     rig: StereoRig
     """With the rows on which the last curve was held."""
-    before: Follower | None
-    """As it was who lost the thread."""
+    before: tuple[Follower, ...]
+    """Who knows how long the thread is."""
     turn: int | None
     """From which of the places a brief search begins; None for one that takes all the time."""
 
@@ -76,7 +77,8 @@ class Again:
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows the thread, with what was known of its length."""
-        return Pursuit(found, field, self.seed, self.setup, self.before, is_fresh=True)
+        before = _who_knew(found.curve, self.before)
+        return Pursuit(found, field, self.seed, self.setup, before, is_fresh=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +90,8 @@ class Closer:
     setup: Setup
     followed: Nurbs
     """Where it is followed."""
-    before: Follower | None
-    """As it was who follows the thread, if its length is known."""
+    before: tuple[Follower, ...]
+    """Who knows how long the thread is."""
 
     def find(self, field: RidgeField, others: Neighbours) -> Found:
         """A thread of the known length through the place of the seed that is none of the others."""
@@ -97,15 +99,25 @@ class Closer:
             found = self.setup.look(field, self.seed)
         except (InitializationError, InputError):  # The place may have left the image.
             return None
-        known_lengths = () if self.before is None else self.before.known_lengths
         rig = self.setup.rig.with_row_offset(found.row_offset_px)
-        if lies_on(found.curve, others, rig) or not has_length(found.curve, known_lengths):
+        if lies_on(found.curve, others, rig) or not has_length(found.curve, lengths(self.before)):
             return None
         return directed(found, self.followed)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows what this look found."""
-        return Pursuit(found, field, self.seed, self.setup, self.before)
+        before = _who_knew(found.curve, self.before)
+        return Pursuit(found, field, self.seed, self.setup, before)
 
 
 Search = FromSeed | Again | Closer
+
+
+def lengths(followers: tuple[Follower, ...]) -> tuple[float, ...]:
+    """What the length of the thread may be, by those who know it."""
+    return tuple(known for follower in followers for known in follower.known_lengths)
+
+
+def _who_knew(curve: Nurbs, before: tuple[Follower, ...]) -> Follower | None:
+    """Who knew a length that is nearest to that of the curve; None where nobody knew any."""
+    return min(before, key=lambda f: length_error(curve, f.known_lengths), default=None)

@@ -15,7 +15,7 @@ from suturetrack.tracking.looks import Look, Outcome
 from suturetrack.tracking.pursuit import Pursuit
 from suturetrack.tracking.recovery import Setup, has_length
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
-from suturetrack.tracking.searches import Again, Closer, FromSeed, Search
+from suturetrack.tracking.searches import Again, Closer, FromSeed, Search, lengths
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.tracking.strangers import Strangers
 from suturetrack.tracking.sureness import SURE, Sureness
@@ -56,6 +56,8 @@ class Thread:
         self._sureness: Sureness | None = None
         self._strangers = Strangers()
         self._was_sure = last is not None
+        self._known: Follower | None = None
+        """As it was who followed the thread when that was sure last."""
         self._longest = 0.0
         self._seeded_at = 0.5
         self._rest = self._failures = 0
@@ -127,7 +129,8 @@ class Thread:
         self._followed = state
         is_sure = self._sureness is not None and self._sureness.is_sure
         is_sure &= not self._strangers.is_found
-        self._was_sure |= is_sure
+        if is_sure:
+            self._was_sure, self._known = True, copy.copy(self.follower)
         if state.status is Status.TRACKING and not is_sure:
             state = replace(state, status=Status.OCCLUDED)
         self._state = state
@@ -160,16 +163,13 @@ class Thread:
         self._rest = _REST << min(max(self._failures - _QUICK_ATTEMPTS, 0), _RAREST)
         self._failures += 1
         turn = self._failures - 1 if is_beside else None
-        follower = copy.copy(self.follower)
-        if follower is not None:
-            last, rig = follower.last_good, follower.rig
-            # What was never sure to be the thread does not tell its length.
-            before = follower if self._was_sure else None
-            lengths = follower.known_lengths if self._was_sure else ()
-            return Again(self._seed, self._setup, last, lengths, rig, before, turn)
+        if self.follower is not None:
+            last, rig = self.follower.last_good, self.follower.rig
+            before = self._who_knows_its_length()
+            return Again(self._seed, self._setup, last, lengths(before), rig, before, turn)
         assert self._state.curve is not None
         known = (self._state.length,) if self._failures <= _QUICK_ATTEMPTS else ()
-        return Again(self._seed, self._setup, self._state.curve, known, self._setup.rig, None, turn)
+        return Again(self._seed, self._setup, self._state.curve, known, self._setup.rig, (), turn)
 
     def _search_closer(self, now_ns: int) -> Search | None:
         assert self.follower is not None
@@ -177,8 +177,15 @@ class Thread:
         curve = self.follower.model.curve
         if not self._sureness.asks_for_look(curve, now_ns):
             return None
-        before = copy.copy(self.follower) if self._was_sure else None
+        before = self._who_knows_its_length()
         return Closer(self._place_to_look_from(curve), self._setup, curve, before)
+
+    def _who_knows_its_length(self) -> tuple[Follower, ...]:
+        """Who follows the thread, and who did when that was sure last: another curve may have been taken
+        for it since. Nobody, where it never was sure."""
+        if not self._was_sure:
+            return ()
+        return tuple(copy.copy(f) for f in (self._known, self.follower) if f is not None)
 
     def _place_to_look_from(self, curve: Nurbs) -> Seed:
         """On the curve where it was found; a hopeless one is not what was meant by the seed."""
