@@ -14,6 +14,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, initialize
 from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.tracking.control_points import rearrange, refit
+from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.gauss_newton import expected
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Doubt
 from suturetrack.tracking.sampling import Samples
@@ -71,6 +72,19 @@ def test_the_unit_of_the_calibration_does_not_matter() -> None:
         assert state.curve is not None
         curves.append(state.curve.control_points / scale)
     np.testing.assert_allclose(curves[0], curves[1], atol=1e-3)
+
+
+def test_a_lost_curve_that_has_grown_far_too_long_goes_back_to_where_it_was(rig: StereoRig) -> None:
+    truth = thread(0.0)
+    near, far = (paint(rig, [scale * truth], 0) for scale in (1, 2))
+    curves = [initialize(field, rig, seed_on(rig, truth)).curve for field in (near, far)]
+    follower = Follower(curves[0], near, rig, TrackingConfig())
+    for i in range(1, 25):
+        state = follower.step(paint(rig, [truth] if i < 10 else [], i), "0")
+    assert state.status is Status.LOST
+    follower.model.curve = curves[1]
+    lengths = [follower.step(paint(rig, [2 * truth], i), "0").length for i in range(25, 28)]
+    assert max(lengths) < 1.1 * metrics.polyline_length(truth)
 
 
 def test_a_thread_that_vanishes_is_lost_in_time_and_found_again(rig: StereoRig) -> None:

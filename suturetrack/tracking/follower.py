@@ -45,7 +45,8 @@ _GROWTH = 0.02
 # A thread that is not alone is not longer by more.
 _DETOUR = 0.005
 _NOISE_SIGMAS = 3.0
-_LEAST_LEFT = 0.65
+# What is shorter or longer by more has nothing to do with the thread.
+_LEAST_LEFT, _MOST_ADDED = 0.65, 1.5
 _ALL = 0.97
 _SURE_AFTER_S = 0.08
 # How long a doubtful end is held before it is cut off.
@@ -221,7 +222,7 @@ class Follower:
         self._lost = status is Status.LOST
         if status is Status.TRACKING:
             self.last_good = model.curve
-        elif self._lost and (evidence.share < _SOME or self._is_rest):
+        elif self._lost and (evidence.share < _SOME or self._is_beyond_hope):
             self._start_again()
         elif uncertain_s > _PATIENCE_S and self.config.method != "paper":
             self._trim(wrong | self._doubt.hopeless)
@@ -244,9 +245,10 @@ class Follower:
         return self._cut and length < (1 - _LENGTH_TOLERANCE) * self.known_length
 
     @property
-    def _is_rest(self) -> bool:
-        """Whether little is left of the curve."""
-        return length_of(self.model.curve) < _LEAST_LEFT * self.known_length
+    def _is_beyond_hope(self) -> bool:
+        """Whether little of the thread's length is left, or far too much was added."""
+        length, longest = length_of(self.model.curve), max(self.known_lengths)
+        return length < _LEAST_LEFT * self.known_length or length > _MOST_ADDED * longest
 
     def _trim(self, wrong: Bool) -> None:
         """Cuts off what has left the thread at an end, to be found anew."""
