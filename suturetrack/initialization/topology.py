@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.pricing import FREE_END, Merge, price_merges
-from suturetrack.initialization.segments import Ridges
+from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.initialization.strands import REACH, Strands
 from suturetrack.types import Float64
 
@@ -29,6 +29,8 @@ _ONE_STRAND = 2.5
 """Energy up to which two arms with a hidden stretch in between are one strand."""
 _AS_STRONG = 0.5
 """Ratio of their strengths, at least."""
+_FACING = 0.5
+"""Cosine of the angle by which an end may miss another one that it points at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +107,7 @@ def _bridge_hidden(
     free = [end for end in range(2 * len(ridges.segments)) if end not in partner]
     if strands is None or len(free) < 2:
         return frozenset()
-    places = np.array([ridges.segments[end // 2][-(end % 2)] for end in free])
-    strength = [float(np.median(ridges.sample(ridges.segments[end // 2]))) for end in free]
-    ways = [
-        (strands.goes_on(free[a], free[b]), free[a], free[b])
-        for a, b in cKDTree(places).query_pairs(_LONGEST_HIDDEN_PX)
-        if _AS_STRONG < strength[a] / strength[b] < 1 / _AS_STRONG
-    ]
+    ways = [(strands.goes_on(i, j), i, j) for i, j in _facing(free, ridges)]
     hidden: set[int] = set()
     for energy, i, j in sorted(ways):
         if energy > _ONE_STRAND:
@@ -122,6 +118,23 @@ def _bridge_hidden(
                 price.setdefault((one, other), FREE_END)
             hidden |= {i, j}
     return frozenset(hidden)
+
+
+def _facing(ends: list[int], ridges: Ridges) -> list[tuple[int, int]]:
+    """Pairs of ends, near each other, of segments of like strength that point at each other."""
+    arms = [ridges.segments[end // 2][:: -1 if end % 2 else 1][: ARM + 1] for end in ends]
+    places = np.array([arm[0] for arm in arms])
+    heading = places - [arm[-1] for arm in arms]
+    heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-9)
+    strength = np.array([np.median(ridges.sample(ridges.segments[end // 2])) for end in ends])
+    a, b = cKDTree(places).query_pairs(_LONGEST_HIDDEN_PX, output_type="ndarray").T
+    way = places[b] - places[a]
+    facing = np.minimum((heading[a] * way).sum(1), -(heading[b] * way).sum(1))
+    is_pair = facing > _FACING * np.linalg.norm(way, axis=1)
+    is_pair &= np.minimum(strength[a], strength[b]) > _AS_STRONG * np.maximum(
+        strength[a], strength[b]
+    )
+    return [(ends[i], ends[j]) for i, j in zip(a[is_pair], b[is_pair], strict=True)]
 
 
 def _uncross(
