@@ -12,7 +12,7 @@ import pytest
 
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import Initialization, initialize
+from suturetrack.initialization import Initialization, InitializationError, initialize
 from suturetrack.initialization.matching import raised
 from suturetrack.tracking import Tracker
 from suturetrack.tracking.follower import Follower
@@ -303,6 +303,35 @@ def test_a_hopeless_curve_is_no_place_to_look_from(
         tracker.step(field)
     assert len(seeds) > 1
     assert [seed == seeds[0] for seed in seeds[1:]] == [from_seed] * (len(seeds) - 1)
+
+
+def test_where_a_thread_was_seeded_long_ago_is_no_place_to_look_from(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was followed for sure, and is found again far away, at first with next to no confidence."""
+    away = range(3, 14)
+    truths = [
+        thread(i / FPS) + np.array([0.0, 15.0 * (i >= away.stop), 0.0]) for i in range(2 * FPS)
+    ]
+    confidences = iter([0.9, 0.01])
+
+    def look(field: RidgeField, rig: StereoRig, seed: Seed, _: object) -> Initialization:
+        if field.stamp.frame >= away.start and seed.pixel is not None:
+            raise InitializationError("nothing is there", np.empty((0, 2)))
+        found = initialize(field, rig, seed_on(rig, truths[field.stamp.frame]))
+        return replace(found, confidence=next(confidences, 0.9))
+
+    looks_by(monkeypatch, look)
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, truths[0]))
+    states = [
+        tracker.step(paint(rig, [] if i in away else [points], i)).states[0]
+        for i, points in enumerate(truths)
+    ]
+    again = next(i for i, state in enumerate(states) if "found again" in state.events)
+    assert states[again].status is Status.OCCLUDED
+    assert states[-1].status is Status.TRACKING
+    assert rms(states[-1], truths[-1]) < 0.1
 
 
 @pytest.mark.parametrize(("first", "later"), [(0.6, 1.0), (1.0, 0.3)])

@@ -188,9 +188,10 @@ class Thread:
         return tuple(copy.copy(f) for f in (self._known, self.follower) if f is not None)
 
     def _place_to_look_from(self, curve: Nurbs) -> Seed:
-        """On the curve where it was found; a hopeless one is not what was meant by the seed."""
+        """On the curve where it was found; a hopeless one is not what was meant by the seed, which is left
+        behind by what was followed for sure."""
         assert self._sureness is not None
-        if self._sureness.is_hopeless:
+        if self._sureness.is_hopeless and not self._was_sure:
             return self._seed
         x, y, z = (float(c) for c in evaluate(curve, np.array([self._seeded_at]))[0])
         return Seed(self.name, point=(x, y, z))
