@@ -58,6 +58,20 @@ def looks_by(monkeypatch: pytest.MonkeyPatch, look: Look) -> None:
     monkeypatch.setattr("suturetrack.tracking.recovery.initialize", look)
 
 
+def loses_the_first(monkeypatch: pytest.MonkeyPatch, lost_at: int) -> None:
+    """Whoever follows a thread first loses it in a frame, for good."""
+    step = Follower.step
+    first: list[Follower] = []
+
+    def lose(self: Follower, field: RidgeField, *args: object) -> ThreadState:
+        state = step(self, field, *args)  # type: ignore[arg-type]
+        first[:] = first or [self]
+        is_lost = self is first[0] and field.stamp.frame >= lost_at
+        return replace(state, status=Status.LOST) if is_lost else state
+
+    monkeypatch.setattr(Follower, "step", lose)
+
+
 def tracker_of(rig: StereoRig) -> Tracker:
     tracker = Tracker(rig)
     for name, points in zip("ab", pair(0), strict=True):
@@ -434,23 +448,16 @@ def test_what_was_followed_for_sure_is_known_again(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch, other: bool
 ) -> None:
     """However doubtful it looks by itself, but nothing else is."""
-    lost_at, step = 6, Follower.step
+    lost_at = 6
     truth, elsewhere = thread(0.0), thread(0.0) + np.array([0.0, 6.0, 0.0])
-    first: list[Follower] = []
     confidences = iter([0.9])
-
-    def lose(self: Follower, field: RidgeField, *args: object) -> ThreadState:
-        state = step(self, field, *args)  # type: ignore[arg-type]
-        first[:] = first or [self]
-        is_lost = self is first[0] and field.stamp.frame >= lost_at
-        return replace(state, status=Status.LOST) if is_lost else state
 
     def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
         confidence = next(confidences, 0.3)
         points = elsewhere if other and confidence < 0.5 else truth
         return replace(initialize(field, rig, seed_on(rig, points)), confidence=confidence)
 
-    monkeypatch.setattr(Follower, "step", lose)
+    loses_the_first(monkeypatch, lost_at)
     looks_by(monkeypatch, look)
     fields = [paint(rig, [truth, elsewhere], i) for i in range(12)]
     tracker = Tracker(rig)
@@ -465,17 +472,10 @@ def test_what_was_taken_for_the_thread_since_does_not_tell_its_length_alone(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A strand as long as the thread is held in doubt, and grows; the thread is known by its own length."""
-    lost_at, plain_at, step = 6, 50, Follower.step
+    lost_at, plain_at = 6, 50
     truth = thread(0.0)
     longer = thread(1.0, 140.0, bend=-0.6) + np.array([0.0, 30.0, 0.0])
     grown = [longer[: round(600 * np.clip(88 + i, 100, 125) / 140)] for i in range(90)]
-    first: list[Follower] = []
-
-    def lose(self: Follower, field: RidgeField, *args: object) -> ThreadState:
-        state = step(self, field, *args)  # type: ignore[arg-type]
-        first[:] = first or [self]
-        is_lost = self is first[0] and field.stamp.frame >= lost_at
-        return replace(state, status=Status.LOST) if is_lost else state
 
     def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
         number = field.stamp.frame
@@ -483,7 +483,7 @@ def test_what_was_taken_for_the_thread_since_does_not_tell_its_length_alone(
         found = initialize(field, rig, seed_on(rig, grown[number] if is_other else truth))
         return replace(found, confidence=0.3 if is_other else 0.9)
 
-    monkeypatch.setattr(Follower, "step", lose)
+    loses_the_first(monkeypatch, lost_at)
     looks_by(monkeypatch, look)
     tracker = Tracker(rig)
     tracker.seed(seed_on(rig, truth))
