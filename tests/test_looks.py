@@ -215,10 +215,14 @@ def test_what_is_found_again_is_followed_on_the_rows_that_show_it(
     assert rms(states[-1], points) < 0.1
 
 
-def follow(rig: StereoRig, truths: Sequence[np.ndarray]) -> list[ThreadState]:
+def follow(
+    rig: StereoRig, truths: Sequence[np.ndarray], away: range = range(0)
+) -> list[ThreadState]:
+    """The states of a thread that is away in some frames."""
     tracker = Tracker(rig)
     tracker.seed(seed_on(rig, truths[0]))
-    return [tracker.step(paint(rig, [points], i)).states[0] for i, points in enumerate(truths)]
+    fields = [paint(rig, [] if i in away else [points], i) for i, points in enumerate(truths)]
+    return [tracker.step(field).states[0] for field in fields]
 
 
 def test_looks_at_a_thread_that_bends_add_up(
@@ -336,12 +340,7 @@ def test_where_a_thread_was_seeded_long_ago_is_no_place_to_look_from(
         return replace(found, confidence=next(confidences, 0.9))
 
     looks_by(monkeypatch, look)
-    tracker = Tracker(rig)
-    tracker.seed(seed_on(rig, truths[0]))
-    states = [
-        tracker.step(paint(rig, [] if i in away else [points], i)).states[0]
-        for i, points in enumerate(truths)
-    ]
+    states = follow(rig, truths, away)
     again = next(i for i, state in enumerate(states) if "found again" in state.events)
     assert states[again].status is Status.OCCLUDED
     assert states[-1].status is Status.TRACKING
@@ -363,12 +362,7 @@ def test_what_was_never_sure_does_not_tell_the_length_but_is_no_stub(
         return replace(found, curve=nurbs.part(found.curve, 0.0, part), confidence=confidence)
 
     looks_by(monkeypatch, look)
-    tracker = Tracker(rig)
-    tracker.seed(seed_on(rig, truths[0]))
-    states = [
-        tracker.step(paint(rig, [] if i in away else [points], i)).states[0]
-        for i, points in enumerate(truths)
-    ]
+    states = follow(rig, truths, away)
     whole = metrics.polyline_length(truths[0])
     assert states[0].length == pytest.approx(first * whole, rel=0.1)
     assert states[away[-1]].status is Status.LOST
