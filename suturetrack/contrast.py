@@ -64,6 +64,8 @@ class Contrast:
     thread is dark."""
     clutter: Float64
     """(3, 3) covariance of the second derivatives around the thread."""
+    scatter: Float64
+    """(3, 3) covariance of the second derivative across along the thread."""
     sigma: float
     """Scale that suits the thread's width, px."""
 
@@ -76,6 +78,11 @@ class Contrast:
         """By how many deviations of the clutter the thread is darker in a mix."""
         return float(weights @ self.across / math.sqrt(weights @ self.clutter @ weights))
 
+    def shows(self, weights: Float64) -> float:
+        """The same, where what makes the thread itself uneven, such as another one, counts as clutter."""
+        spread = self.clutter + self.scatter
+        return float(weights @ self.across / math.sqrt(weights @ spread @ weights))
+
     def follow(self, seen: Contrast, share: float) -> Contrast:
         """`share` of the way to what was `seen`; this one where that was hardly the same thread."""
         metric = np.linalg.inv(self.clutter + seen.clutter)
@@ -86,15 +93,16 @@ class Contrast:
         distinct = seen.stands_out(seen.weights) >= _LEAST_SCORE
         if not distinct or both < _ALIKE * math.sqrt(ours * theirs):
             return self
-        weights, across, clutter = (
+        weights, across, clutter, scatter = (
             (1 - share) * old + share * new
             for old, new in (
                 (self.weights, seen.weights),
                 (self.across, seen.across),
                 (self.clutter, seen.clutter),
+                (self.scatter, seen.scatter),
             )
         )
-        return Contrast(weights / np.abs(weights).sum(), across, clutter, self.sigma)
+        return Contrast(weights / np.abs(weights).sum(), across, clutter, scatter, self.sigma)
 
     def fainter(self, share: float, clear: Contrast) -> Contrast:
         """As if it stood out by a `share` only, or by a quarter of what was `clear`, if that is more."""
@@ -314,9 +322,13 @@ def _follow(scene: _Scene, start: tuple[int, int]) -> tuple[Float64, _Ridge] | N
 
 
 def _fisher(nuisance: Float64, across: Float64) -> Float64:
-    scatter = np.atleast_2d(np.cov(across.T)) if len(across) > 1 else 0.0
-    weights = np.linalg.solve(nuisance + scatter, np.median(across, axis=0))
+    weights = np.linalg.solve(nuisance + _scatter(across), np.median(across, axis=0))
     return weights / max(np.abs(weights).sum(), 1e-9)
+
+
+def _scatter(across: Float64) -> Float64:
+    channels = across.shape[1]
+    return np.atleast_2d(np.cov(across.T)) if len(across) > 1 else np.zeros((channels, channels))
 
 
 def _score(scene: _Scene, weights: Float64, ridge: _Ridge, covariance: Float64) -> float:
@@ -329,19 +341,20 @@ def _score(scene: _Scene, weights: Float64, ridge: _Ridge, covariance: Float64) 
 
 def _contrast(clutter: Float64, across: Float64, sigma: float, means: Float64) -> Contrast:
     """From the (channels, channels) clutter and (N, channels) derivatives across, grey levels."""
-    middle, weights = np.median(across, axis=0), _fisher(clutter, across)
+    middle, weights, scatter = np.median(across, axis=0), _fisher(clutter, across), _scatter(across)
     if len(weights) == 1:
         weights, middle, clutter = weights * GRAY, np.repeat(middle, 3), np.full((3, 3), clutter)
         clutter = clutter + 1e-3 * clutter[0, 0] * np.eye(3)
+        scatter = np.full((3, 3), scatter)
     else:
-        total = clutter + np.cov(across.T)
+        total = clutter + scatter
         gray = GRAY * np.sign(middle @ GRAY)
         shown = [middle @ w / math.sqrt(w @ total @ w) for w in (weights, gray)]
         if shown[0] < _WORTH * shown[1]:
             weights = gray
     weights = weights * means
-    clutter = clutter / np.outer(means, means)
-    return Contrast(weights / np.abs(weights).sum(), middle / means, clutter, sigma)
+    clutter, scatter = (spread / np.outer(means, means) for spread in (clutter, scatter))
+    return Contrast(weights / np.abs(weights).sum(), middle / means, clutter, scatter, sigma)
 
 
 def _dark_ridge(scene: _Scene, weights: Float64, start: tuple[int, int]) -> _Ridge | None:

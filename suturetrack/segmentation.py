@@ -45,7 +45,9 @@ _FADE = 0.5
 # Fewest pixels of a curve from which contrast is learned.
 _FEWEST_PIXELS = 8
 # Worth of a mix in which some threads are dark and others bright, so that both must be looked for.
-_BOTH_SIGNS = 0.7
+_BOTH_SIGNS = 0.5
+# Shares of the mixes of single threads by which the mix of all is refined.
+_FINER = (0.5, 0.25)
 # Least automatic c, grey levels: what a flawless picture's rounding makes.
 _LEAST_C = 1.0
 
@@ -284,16 +286,19 @@ def _joint_mix(threads: list[Contrast], polarity: Polarity) -> Float64:
     if polarity == "bright":
         return -_joint_mix(threads, "dark")
     ways = itertools.product(*[(1.0,)] + [(1.0, 0.0, -1.0)] * (len(threads) - 1))
-    own = [t.weights / math.sqrt(t.weights @ t.clutter @ t.weights) for t in threads]
+    own = [t.weights / math.sqrt(t.weights @ (t.clutter + t.scatter) @ t.weights) for t in threads]
     mixes = [np.tensordot(way, own, 1) for way in ways] + own
 
     def least(mix: Float64) -> float:
-        shown = np.array([t.stands_out(mix) for t in threads])
+        shown = np.array([t.shows(mix) for t in threads])
         if (shown > 0).all():
             return float(shown.min())
         return _BOTH_SIGNS * float(np.abs(shown).min()) if polarity in ("auto", "both") else 0.0
 
-    return np.asarray(max(mixes, key=least))
+    best = max(mixes, key=least)
+    for share in _FINER:
+        best = max([best, *(best + way * mix for mix in own for way in (share, -share))], key=least)
+    return np.asarray(best)
 
 
 class _View:

@@ -411,6 +411,35 @@ def test_places_that_are_clear_in_one_look_each_are_sure_together(
     assert not sureness.is_sure
 
 
+@pytest.mark.parametrize("as_long", [True, False])
+def test_doubts_about_a_curve_are_not_settled_by_looks_at_a_longer_one(
+    rig: StereoRig, as_long: bool
+) -> None:
+    """An end beside another ridge, as one look sees it, is a crossing once the curve runs on there."""
+    part = 1.0 if as_long else 0.9
+    sureness: Sureness | None = None
+    for turn, (left, length) in enumerate([(((0.4, 0.3),), part), (((0.9, 0.3),), 1.0)]):
+        found = look_at(rig, thread(0.6 * turn), 0.3)
+        curve = nurbs.part(found.curve, 0.0, length)
+        found = replace(found, curve=curve, doubts=(left, ()))
+        sureness = sureness or Sureness(found, curve, 0, rig)
+        assert not sureness.is_sure
+        sureness.weigh(found, curve)
+    assert sureness is not None
+    assert sureness.is_sure == as_long
+
+
+@pytest.mark.parametrize("stays", [True, False])
+def test_a_doubt_that_stays_is_not_voted_down(rig: StereoRig, stays: bool) -> None:
+    looks = [look_at(rig, thread(0.6 * turn), 0.4) for turn in range(8)]
+    if stays:
+        looks = [replace(look, doubts=(((0.9, 0.5),), ())) for look in looks]
+    sureness = Sureness(looks[0], looks[0].curve, 0, rig)
+    for look in looks[1:]:
+        assert not sureness.weigh(look, look.curve)
+    assert sureness.is_sure != stays
+
+
 def look_at(rig: StereoRig, truth: np.ndarray, confidence: float) -> Initialization:
     found = initialize(paint(rig, [truth], 0), rig, seed_on(rig, truth))
     return replace(found, confidence=confidence)

@@ -476,6 +476,20 @@ def test_threads_of_different_colours_are_seen_together() -> None:
     assert strength[75:90, 20:140].mean() < 0.05
 
 
+@pytest.mark.parametrize("number", [221, 222])
+def test_threads_that_cross_near_a_seed_are_seen_together(number: int) -> None:
+    """What is learned at one of the seeds is half of the other thread, of another colour."""
+    scene = open_scene("two-threads", number)
+    frame = StereoFrame(STAMP, *scene.render(0))
+    segmenter = Segmenter(scene.rig)
+    for thread in scene.threads:
+        segmenter.learn(frame, Seed(thread, pixel=scene.seed_pixel(0, thread)))
+    field = segmenter.step(frame)
+    for truth in scene.truth(0):
+        u, v = np.rint(scene.rig.project(truth.points)[0]).astype(int).T
+        assert np.median(np.linalg.norm(field.left[v, u], axis=-1)) > 0.35
+
+
 @pytest.mark.parametrize("light", [(1.6, 1.0, 0.45), (0.55, 0.8, 1.15), (0.4, 0.4, 0.4)])
 def test_another_exposure_and_white_balance_show_the_same(
     scene: Scene, light: tuple[float, float, float]

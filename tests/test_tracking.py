@@ -319,6 +319,23 @@ def test_a_thread_that_comes_in_at_the_border_is_as_long_as_it_is_seen(rig: Ster
     assert states[-1].length == pytest.approx(100.0, rel=0.01)
 
 
+@pytest.mark.parametrize("axis", [0, 2])
+def test_an_end_that_one_view_hides_keeps_its_depth(rig: StereoRig, axis: int) -> None:
+    truths = [thread(0.3) + 0.4 * max(i - 3, 0) * np.eye(3)[axis] for i in range(30)]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    for field, points in zip(fields[6:], truths[6:], strict=True):
+        hidden = rig.project(points)[1][: len(points) // 4]
+        (left, top), (right, bottom) = (
+            (hidden.min(0) - 6).astype(int),
+            (hidden.max(0) + 7).astype(int),
+        )
+        field.right[top:bottom, left:right] = 0.0
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    assert states[-1].status is Status.TRACKING
+    assert 0.7 < states[-1].seen.mean() < 0.8
+    assert max(error(states[-1], truths[-1]).ends) < 0.6
+
+
 def test_what_moves_outside_the_images_is_gone_until_it_comes_in(rig: StereoRig) -> None:
     def swung_out(by: float) -> Nurbs:
         points = np.stack([np.linspace(0, 150, 8), np.zeros(8), np.full(8, 300.0)], axis=1)

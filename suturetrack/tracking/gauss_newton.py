@@ -234,6 +234,7 @@ class _Linearized:
         )
         self.offsets = left, right
         self._hidden = ~(left.found | right.found)
+        self._half_hidden = ~(left.found & right.found)
         self._amounts = [view.speed * samples.share / _CORRELATION_PX for view in self.views]
         self._per_unit = np.maximum(_norm(self.views[0].jacobian[:, 1]), 1e-12)
 
@@ -268,10 +269,10 @@ class _Linearized:
         """The prediction.
 
         The drift is one of pixels, so that the past holds depth no tighter than the images do. Only
-        where the thread is hidden or not alone, it holds it in depth as well.
+        where a view hides the thread, or it is not alone, it holds it in depth as well.
         """
         jacobians = self.views[0].jacobian, self.views[1].jacobian
-        firmness = self._hidden / _HIDDEN_DRIFT_PX**2 + _CROWDED_HOLD * crowd / surprise**2
+        firmness = self._half_hidden / _HIDDEN_DRIFT_PX**2 + _CROWDED_HOLD * crowd / surprise**2
         drift = self._amounts[0] / config.drift_px**2 / 2
         held = firmness * self._amounts[0] * self._per_unit**2
         return rows.held_rows(jacobians, reference.points - self.points, drift, held)

@@ -8,19 +8,20 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, PlacedDoubts, remaining
 from suturetrack.metrics import resample
 from suturetrack.nurbs import evaluate
+from suturetrack.tracking.sampling import length_of
 from suturetrack.types import Float64, Nurbs
 
 SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
-# Votes for a curve that make it sure, in those of a look that is just sure by itself.
+# Votes for a curve without doubts that make it sure, in those of a look that is just sure by itself.
 _ENOUGH = 1.5
 # And those that the look by which another curve was voted down has to have more.
 _PLENTY = 3.0
 # Votes below which it is not worth looking from.
 _HOPELESS = 0.01
 # What the doubts that no look has settled leave of a curve that is sure, and how far apart two doubts
-# about one place are, along the curve.
-_TOGETHER, _SAME_PLACE = 0.6, 0.05
+# about one place are, along curves that differ in length by no more.
+_TOGETHER, _SAME_PLACE, _SAME_LENGTH = 0.6, 0.05, 0.025
 # Two looks see the same if they are nowhere further apart, and another thing if they are somewhere.
 _SAME_PX, _OTHER_PX = 5.0, 15.0
 # How much the thread has to bend between two looks that both count.
@@ -70,8 +71,9 @@ class Sureness:
         self._accused: Float64 | None = None if before is None else before._accused
         self.is_sure = found.confidence >= SURE and not self._is_accused(curve)
         """Whether the curve that is followed may be called the thread."""
-        self._evidence = _evidence(found)
-        self._doubts: PlacedDoubts | None = found.doubts
+        self._evidence, self._length = 0.0, 0.0
+        self._doubts: PlacedDoubts | None = None
+        self._settle(found)
         self._shape = self._outline(curve)
         self._looks, self._last_ns = 0, now_ns
 
@@ -95,7 +97,7 @@ class Sureness:
         if self.is_sure:
             self._accused = self._outline(curve)
             self.is_sure, self._votes = False, _HOPELESS
-            self._evidence, self._doubts = 0.0, None
+            self._doubts = None
             self._looks, self._last_ns = 0, now_ns
 
     def weigh(self, found: Initialization, followed: Nurbs) -> bool:
@@ -115,20 +117,32 @@ class Sureness:
             return False
         self._votes += _votes(confidence) if agrees else -_votes(confidence)
         is_outvoted = self._votes < 0
-        self.is_sure = self._votes >= _ENOUGH if agrees else -self._votes >= _PLENTY
+        self.is_sure = -self._votes >= _PLENTY
         self._votes, self._shape = abs(self._votes), places[0 if is_outvoted else 1]
         if is_outvoted:
-            self._evidence, self._doubts = _evidence(found), found.doubts
+            self._doubts = None
+            self._settle(found)
         elif agrees:
-            self._evidence = max(self._evidence, _evidence(found))
-            self._doubts = _lessened(self._doubts or found.doubts, found.doubts)
-            self.is_sure |= self._evidence * remaining(self._doubts) >= _TOGETHER
+            left = self._settle(found)
+            self.is_sure = max(self._evidence, self._votes >= _ENOUGH) * left >= _TOGETHER
         return is_outvoted
 
     def is_same(self, found: Nurbs, followed: Nurbs) -> bool:
         """Whether what was found is what is followed, which may lack a little at its ends."""
         both = zip(self._lines(found), self._lines(followed), strict=True)
         return max(_apart(whole, part) for whole, part in both) < _SAME_PX
+
+    def _settle(self, found: Initialization) -> float:
+        """What the doubts leave of the curve that a look settles where it does not share them.
+
+        Along a curve of another length the places are others: all doubts are new.
+        """
+        length, evidence, doubts = length_of(found.curve), _evidence(found), found.doubts
+        if self._doubts is not None and abs(length - self._length) < _SAME_LENGTH * self._length:
+            length, evidence = self._length, max(self._evidence, evidence)
+            doubts = _lessened(self._doubts, doubts)
+        self._evidence, self._doubts, self._length = evidence, doubts, length
+        return remaining(doubts)
 
     def _is_accused(self, curve: Nurbs) -> bool:
         """Whether it is a curve that was revoked, and has not moved."""
