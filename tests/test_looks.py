@@ -317,10 +317,27 @@ def test_a_hopeless_curve_is_no_place_to_look_from(
     looks_by(monkeypatch, look)
     tracker = Tracker(rig)
     tracker.seed(seed_on(rig, pair(0)[0]))
-    for field in fields_of(rig, FPS, range(0)):
-        tracker.step(field)
+    for i in range(2 * FPS):
+        tracker.step(paint(rig, pair(0), i))
     assert len(seeds) > 1
     assert [seed == seeds[0] for seed in seeds[1:]] == [from_seed] * (len(seeds) - 1)
+
+
+def test_a_hopeless_curve_that_has_left_its_seed_is_looked_at_where_it_is(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def look(field: RidgeField, rig: StereoRig, seed: Seed, _: object) -> Initialization:
+        if field.stamp.frame and seed.pixel is not None:
+            raise InitializationError("nothing is there", np.empty((0, 2)))
+        confidence = 0.9 if field.stamp.frame else 0.001
+        return replace(initialize(field, rig, seed), confidence=confidence)
+
+    looks_by(monkeypatch, look)
+    truths = [thread(i / FPS) for i in range(2 * FPS)]
+    states = follow(rig, truths)
+    assert states[0].status is Status.OCCLUDED
+    assert states[-1].status is Status.TRACKING
+    assert rms(states[-1], truths[-1]) < 0.1
 
 
 def test_where_a_thread_was_seeded_long_ago_is_no_place_to_look_from(

@@ -59,7 +59,7 @@ class Thread:
         self._known: Follower | None = None
         """As it was who followed the thread when that was sure last."""
         self._longest = 0.0
-        self._seeded_at = 0.5
+        self._seeded_at, self._has_left_seed = 0.5, False
         self._rest = self._failures = 0
 
     @property
@@ -189,9 +189,10 @@ class Thread:
 
     def _place_to_look_from(self, curve: Nurbs) -> Seed:
         """On the curve where it was found; a hopeless one is not what was meant by the seed, which is left
-        behind by what was followed for sure."""
+        behind by what was followed for sure, or has moved where the seed shows nothing any more."""
         assert self._sureness is not None
-        if self._sureness.is_hopeless and not self._was_sure:
+        has_left_seed, self._has_left_seed = self._was_sure or self._has_left_seed, False
+        if self._sureness.is_hopeless and not has_left_seed:
             return self._seed
         x, y, z = (float(c) for c in evaluate(curve, np.array([self._seeded_at]))[0])
         return Seed(self.name, point=(x, y, z))
@@ -206,7 +207,7 @@ class Thread:
         if isinstance(search, FromSeed):
             self._take_first(outcome, look.fields)
         elif outcome.pursuit is None or outcome.pursuit.lies_on(others):
-            return
+            self._has_left_seed = search.seed is self._seed
         elif isinstance(search, Again):
             self._take_again(outcome, search.known_lengths)
         else:
