@@ -46,7 +46,7 @@ class Sureness:
     did, or if it is sure by itself.
 
     A place that one look doubts may be clear in another one that finds the same: of each doubt of the
-    first look only the least is left that any has there.
+    first look only the least is left that any has there. No votes outweigh one that stays.
 
     A curve that was sure and is revoked stands accused until it moves: what lies still and is no thread
     looks the same in every look.
