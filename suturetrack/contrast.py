@@ -46,8 +46,8 @@ _BELOW = 0.8
 _WORTH = 1.1
 # Along a curve: how many windows are looked at, and half their width.
 _WINDOWS, _HALF_PX = 10, 32
-# Least cosine between two looks at one thread: 0.88 and more on one ground, elsewhere any; other
-# colours give up to 0.64.
+# Least cosine between two looks at one thread, or two places on it: 0.88 and more on one ground,
+# elsewhere any; other colours give up to 0.64.
 _ALIKE = 0.5
 # What a thread that is lost keeps of the contrast with which it was seen last.
 _FAINTEST = 0.25
@@ -64,8 +64,6 @@ class Contrast:
     thread is dark."""
     clutter: Float64
     """(3, 3) covariance of the second derivatives around the thread."""
-    scatter: Float64
-    """(3, 3) covariance of the second derivative across along the thread."""
     sigma: float
     """Scale that suits the thread's width, px."""
 
@@ -78,11 +76,6 @@ class Contrast:
         """By how many deviations of the clutter the thread is darker in a mix."""
         return float(weights @ self.across / math.sqrt(weights @ self.clutter @ weights))
 
-    def shows(self, weights: Float64) -> float:
-        """The same, where what makes the thread itself uneven, such as another one, counts as clutter."""
-        spread = self.clutter + self.scatter
-        return float(weights @ self.across / math.sqrt(weights @ spread @ weights))
-
     def follow(self, seen: Contrast, share: float) -> Contrast:
         """`share` of the way to what was `seen`; this one where that was hardly the same thread."""
         metric = np.linalg.inv(self.clutter + seen.clutter)
@@ -93,16 +86,15 @@ class Contrast:
         distinct = seen.stands_out(seen.weights) >= _LEAST_SCORE
         if not distinct or both < _ALIKE * math.sqrt(ours * theirs):
             return self
-        weights, across, clutter, scatter = (
+        weights, across, clutter = (
             (1 - share) * old + share * new
             for old, new in (
                 (self.weights, seen.weights),
                 (self.across, seen.across),
                 (self.clutter, seen.clutter),
-                (self.scatter, seen.scatter),
             )
         )
-        return Contrast(weights / np.abs(weights).sum(), across, clutter, scatter, self.sigma)
+        return Contrast(weights / np.abs(weights).sum(), across, clutter, self.sigma)
 
     def fainter(self, share: float, clear: Contrast) -> Contrast:
         """As if it stood out by a `share` only, or by a quarter of what was `clear`, if that is more."""
@@ -140,7 +132,8 @@ def contrast_at(image: Image, pixel: tuple[float, float]) -> Contrast | None:
         octave, sigma, zoom = best.octave - 1, _BELOW * SIGMAS[1], 2
     crop, seed = _window(*_shrunk(image, pixel, octave), zoom * _WINDOW_PX)
     scene = _Scene.of(crop, sigma)
-    across = _Ridge(zoom * best.ridge.pixels + seed, best.ridge.normals).across(scene)
+    ridge = _Ridge(zoom * best.ridge.pixels + seed, best.ridge.normals)
+    across = _of_one_thread(scene, ridge, seed)
     return _contrast(scene.clutter, across, sigma * 2**octave, channel_means(image))
 
 
@@ -322,13 +315,9 @@ def _follow(scene: _Scene, start: tuple[int, int]) -> tuple[Float64, _Ridge] | N
 
 
 def _fisher(nuisance: Float64, across: Float64) -> Float64:
-    weights = np.linalg.solve(nuisance + _scatter(across), np.median(across, axis=0))
+    scatter = np.atleast_2d(np.cov(across.T)) if len(across) > 1 else 0.0
+    weights = np.linalg.solve(nuisance + scatter, np.median(across, axis=0))
     return weights / max(np.abs(weights).sum(), 1e-9)
-
-
-def _scatter(across: Float64) -> Float64:
-    channels = across.shape[1]
-    return np.atleast_2d(np.cov(across.T)) if len(across) > 1 else np.zeros((channels, channels))
 
 
 def _score(scene: _Scene, weights: Float64, ridge: _Ridge, covariance: Float64) -> float:
@@ -339,22 +328,34 @@ def _score(scene: _Scene, weights: Float64, ridge: _Ridge, covariance: Float64) 
     return (middle - max(rim, 0.0)) / max(math.sqrt(weights @ covariance @ weights), 1e-9)
 
 
+def _of_one_thread(scene: _Scene, ridge: _Ridge, seed: Float64) -> Float64:
+    """(N, channels) second derivatives across the ridge where it is like it is near the seed.
+
+    A ridge may turn onto another thread where the two cross.
+    """
+    across, metric = ridge.across(scene), np.linalg.inv(scene.clutter)
+    away = np.linalg.norm(ridge.pixels - seed, axis=1)
+    near = np.median(across[away <= away.min() + _SNAP_PX], axis=0)
+    lengths = np.sqrt(np.einsum("ij,jk,ik->i", across, metric, across) * (near @ metric @ near))
+    alike = across @ metric @ near >= _ALIKE * lengths
+    return across[alike] if np.count_nonzero(alike) >= _SHORTEST_PX else across
+
+
 def _contrast(clutter: Float64, across: Float64, sigma: float, means: Float64) -> Contrast:
     """From the (channels, channels) clutter and (N, channels) derivatives across, grey levels."""
-    middle, weights, scatter = np.median(across, axis=0), _fisher(clutter, across), _scatter(across)
+    middle, weights = np.median(across, axis=0), _fisher(clutter, across)
     if len(weights) == 1:
         weights, middle, clutter = weights * GRAY, np.repeat(middle, 3), np.full((3, 3), clutter)
         clutter = clutter + 1e-3 * clutter[0, 0] * np.eye(3)
-        scatter = np.full((3, 3), scatter)
     else:
-        total = clutter + scatter
+        total = clutter + np.cov(across.T)
         gray = GRAY * np.sign(middle @ GRAY)
         shown = [middle @ w / math.sqrt(w @ total @ w) for w in (weights, gray)]
         if shown[0] < _WORTH * shown[1]:
             weights = gray
     weights = weights * means
-    clutter, scatter = (spread / np.outer(means, means) for spread in (clutter, scatter))
-    return Contrast(weights / np.abs(weights).sum(), middle / means, clutter, scatter, sigma)
+    clutter = clutter / np.outer(means, means)
+    return Contrast(weights / np.abs(weights).sum(), middle / means, clutter, sigma)
 
 
 def _dark_ridge(scene: _Scene, weights: Float64, start: tuple[int, int]) -> _Ridge | None:

@@ -286,11 +286,11 @@ def _joint_mix(threads: list[Contrast], polarity: Polarity) -> Float64:
     if polarity == "bright":
         return -_joint_mix(threads, "dark")
     ways = itertools.product(*[(1.0,)] + [(1.0, 0.0, -1.0)] * (len(threads) - 1))
-    own = [t.weights / math.sqrt(t.weights @ (t.clutter + t.scatter) @ t.weights) for t in threads]
+    own = [t.weights / math.sqrt(t.weights @ t.clutter @ t.weights) for t in threads]
     mixes = [np.tensordot(way, own, 1) for way in ways] + own
 
     def least(mix: Float64) -> float:
-        shown = np.array([t.shows(mix) for t in threads])
+        shown = np.array([t.stands_out(mix) for t in threads])
         if (shown > 0).all():
             return float(shown.min())
         return _BOTH_SIGNS * float(np.abs(shown).min()) if polarity in ("auto", "both") else 0.0

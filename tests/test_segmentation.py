@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.special import expit
 
 from suturetrack.camera import StereoRig
-from suturetrack.contrast import GRAY, SIGMAS, contrast_at
+from suturetrack.contrast import GRAY, SIGMAS, contrast_along, contrast_at
 from suturetrack.kernels import ridge
 from suturetrack.segmentation import (
     SegmentationConfig,
@@ -478,16 +478,23 @@ def test_threads_of_different_colours_are_seen_together() -> None:
 
 @pytest.mark.parametrize("number", [221, 222])
 def test_threads_that_cross_near_a_seed_are_seen_together(number: int) -> None:
-    """What is learned at one of the seeds is half of the other thread, of another colour."""
+    """Half of the ridge that runs on from one of the seeds is the other thread, of another colour."""
     scene = open_scene("two-threads", number)
     frame = StereoFrame(STAMP, *scene.render(0))
     segmenter = Segmenter(scene.rig)
     for thread in scene.threads:
         segmenter.learn(frame, Seed(thread, pixel=scene.seed_pixel(0, thread)))
     field = segmenter.step(frame)
+    image = scene.rig.rectify(frame.left, frame.right)[0]
     for truth in scene.truth(0):
-        u, v = np.rint(scene.rig.project(truth.points)[0]).astype(int).T
+        pixels = scene.rig.project(truth.points)[0]
+        u, v = np.rint(pixels).astype(int).T
         assert np.median(np.linalg.norm(field.left[v, u], axis=-1)) > 0.35
+        seed = scene.rig.rectify_pixels(np.array(scene.seed_pixel(0, truth.thread)))
+        learned = contrast_at(image, (float(seed[0]), float(seed[1])))
+        assert learned is not None
+        right = contrast_along(image, pixels, learned.sigma).across
+        assert np.linalg.norm(learned.across - right) < 0.25 * np.linalg.norm(right)
 
 
 @pytest.mark.parametrize("light", [(1.6, 1.0, 0.45), (0.55, 0.8, 1.15), (0.4, 0.4, 0.4)])
