@@ -46,8 +46,6 @@ _FADE = 0.5
 _FEWEST_PIXELS = 8
 # Worth of a mix in which some threads are dark and others bright, so that both must be looked for.
 _BOTH_SIGNS = 0.5
-# Shares of the mixes of single threads by which the mix of all is refined.
-_FINER = (0.5, 0.25)
 # Least automatic c, grey levels: what a flawless picture's rounding makes.
 _LEAST_C = 1.0
 
@@ -295,10 +293,7 @@ def _joint_mix(threads: list[Contrast], polarity: Polarity) -> Float64:
             return float(shown.min())
         return _BOTH_SIGNS * float(np.abs(shown).min()) if polarity in ("auto", "both") else 0.0
 
-    best = max(mixes, key=least)
-    for share in _FINER:
-        best = max([best, *(best + way * mix for mix in own for way in (share, -share))], key=least)
-    return np.asarray(best)
+    return np.asarray(max(mixes, key=least))
 
 
 class _View:
