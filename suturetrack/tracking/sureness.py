@@ -133,7 +133,7 @@ class Sureness:
         return max(_apart(whole, part) for whole, part in both) < _SAME_PX
 
     def _settle(self, found: Initialization) -> float:
-        """What the doubts leave of the curve that a look settles where it does not share them.
+        """Keeps the doubts that this look shares; what they leave of the confidence.
 
         Along a curve of another length the places are others: all doubts are new.
         """
