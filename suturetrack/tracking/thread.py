@@ -59,7 +59,9 @@ class Thread:
         self._known: Follower | None = None
         """As it was who followed the thread when that was sure last."""
         self._longest = 0.0
-        self._seeded_at, self._has_left_seed = 0.5, False
+        self._seeded_at = 0.5
+        self._has_left_seed = False
+        """Whether the last look from the pixel of the seed has found nothing that may be the thread."""
         self._rest = self._failures = 0
 
     @property
@@ -177,8 +179,8 @@ class Thread:
         curve = self.follower.model.curve
         if not self._sureness.asks_for_look(curve, now_ns):
             return None
-        before = self._who_knows_its_length()
-        return Closer(self._place_to_look_from(curve), self._setup, curve, before)
+        place, self._has_left_seed = self._place_to_look_from(curve), False
+        return Closer(place, self._setup, curve, self._who_knows_its_length())
 
     def _who_knows_its_length(self) -> tuple[Follower, ...]:
         """Who follows the thread, and who did when that was sure last: another curve may have been taken
@@ -191,7 +193,7 @@ class Thread:
         """On the curve where it was found; a hopeless one is not what was meant by the seed, which is left
         behind by what was followed for sure, or has moved where the seed shows nothing any more."""
         assert self._sureness is not None
-        has_left_seed, self._has_left_seed = self._was_sure or self._has_left_seed, False
+        has_left_seed = self._was_sure or self._has_left_seed
         if self._sureness.is_hopeless and not has_left_seed:
             return self._seed
         x, y, z = (float(c) for c in evaluate(curve, np.array([self._seeded_at]))[0])
