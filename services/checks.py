@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from typing import Any
 
@@ -77,7 +78,12 @@ def _field(field: RidgeField) -> None:
     shape = field.left.shape
     _require(len(shape) == 3 and shape[2] == 2, f"a field of shape {shape}, expected (H, W, 2)")
     _require(shape == field.right.shape, f"left is {shape}, right is {field.right.shape}")
-    for view in (field.left, field.right):
+    for name, pair in field.own.items():
+        _require(
+            all(view.shape == shape for view in pair),
+            f"the field of thread {name} is {pair[0].shape} and {pair[1].shape}, that of all {shape}",
+        )
+    for view in itertools.chain((field.left, field.right), *field.own.values()):
         # NaN fails both comparisons.
         bounded = view.min() >= -1.001 and view.max() <= 1.001
         _require(bounded, "a field holds components that are not within [-1, 1]")

@@ -125,7 +125,7 @@ class Recorder:
             self.passed(field.stamp, at)
         elif self._file is not None:
             self._pictured = field.stamp.capture_ns
-            copy = replace(field, left=field.left.copy(), right=field.right.copy())
+            copy = _copied(field)
             self._hand_over(lambda file: file.field(copy, at))
 
     def states(self, states: Sequence[ThreadState], published_ns: int | None = None) -> None:
@@ -153,7 +153,7 @@ class Recorder:
         thread that is taken up again has none.
         """
         if results:
-            copy = replace(field, left=field.left.copy(), right=field.right.copy())
+            copy = _copied(field)
             self._hand_over(lambda file: file.initializations(copy, seeds, results))
 
     def truth(self, truth: Truth) -> None:
@@ -224,3 +224,8 @@ class Recorder:
             self._busy_since = None
             if task is None:
                 return
+
+
+def _copied(field: RidgeField) -> RidgeField:
+    own = {name: (left.copy(), right.copy()) for name, (left, right) in field.own.items()}
+    return RidgeField(field.stamp, field.left.copy(), field.right.copy(), own)

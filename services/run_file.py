@@ -23,7 +23,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.types import InputError
 
 APPLICATION = "suturetrack"
-RECORDING_VERSION = 1
+RECORDING_VERSION = 2
 """Grows when an older reader could misread a recording."""
 
 _log = logging.getLogger(__name__)

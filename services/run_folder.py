@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from services.messages import Forget
@@ -26,6 +25,7 @@ from services.writer import Request
 from suturetrack.camera import Camera, StereoRig
 from suturetrack.types import (
     Energies,
+    Float32,
     Float64,
     Image,
     InputError,
@@ -141,7 +141,8 @@ class RunFolder:
     def fields(self) -> Iterator[RidgeField]:
         """All fields of a full recording in order, each read when it is asked for."""
         for stamp, left, right in self._pairs("field", _field):
-            yield RidgeField(stamp, left, right)
+            own = {name: (left[name], right[name]) for name in left if name}
+            yield RidgeField(stamp, left[""], right[""], own)
 
     def _parsed(self, rows: Iterable[Row], parse: Callable[[Row], T], what: str) -> list[T]:
         """The values in the rows; what a newer version wrote in another form is left out."""
@@ -156,11 +157,9 @@ class RunFolder:
             self.problems.append(problem)
         return parsed
 
-    def _pairs(
-        self, name: str, read: Callable[[Row], NDArray[Any] | None]
-    ) -> Iterator[tuple[Stamp, NDArray[Any], NDArray[Any]]]:
+    def _pairs(self, name: str, read: Callable[[Row], T | None]) -> Iterator[tuple[Stamp, T, T]]:
         """What both views recorded under a name, by frame; chunks come in the order of time."""
-        waiting: dict[int, NDArray[Any]] = {}
+        waiting: dict[int, T] = {}
         for row in self.rows(f"/rig/left/{name}", f"/rig/right/{name}"):
             picture = read(row)
             if picture is None:
@@ -298,10 +297,12 @@ def _image(row: Row) -> Image | None:
     return None
 
 
-def _field(row: Row) -> NDArray[Any] | None:
+def _field(row: Row) -> dict[str, Float32] | None:
+    """The field of all threads, under no name, and those of single ones."""
     if "RidgeField:vectors" not in row:
         return None
-    return row["RidgeField:vectors"].reshape(row["RidgeField:shape"])
+    vectors = row["RidgeField:vectors"].reshape(-1, *row["RidgeField:shape"][-3:])
+    return dict(zip(("", *row.get("RidgeField:threads", ())), vectors, strict=True))
 
 
 def _part(file: Path) -> tuple[str, int]:

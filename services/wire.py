@@ -1,14 +1,15 @@
 """Types <-> bytes.
 
-Frames and fields travel as their raw arrays, left then right; the header in the attachment gives
-shapes, dtype and stamp. Everything else travels as MessagePack, arrays as nested lists. The encoding
-names the schema and its version: `application/octet-stream;frame/1`, `application/msgpack;state/1`.
-Lengths on the wire are in metres.
+Frames and fields travel as their raw arrays, left then right, then those of single threads; the header
+in the attachment gives shapes, dtype, stamp and threads. Everything else travels as MessagePack, arrays
+as nested lists. The encoding names the schema and its version: `application/octet-stream;frame/1`,
+`application/msgpack;state/1`. Lengths on the wire are in metres.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -46,10 +47,12 @@ LARGEST_SMALL_MESSAGE = 1 << 20
 """Bytes of a MessagePack payload and of an attachment; a state of 100 control points has 5 kB."""
 LARGEST_SIDE = 8192
 """Pixels."""
+MOST_THREADS = 64
+"""With a field of their own."""
 
 _RAW: dict[type[Any], tuple[str, np.dtype[Any]]] = {
     StereoFrame: ("frame/1", np.dtype("<u1")),
-    RidgeField: ("field/1", np.dtype("<f4")),
+    RidgeField: ("field/2", np.dtype("<f4")),
 }
 _SMALL: dict[type[Any], str] = {
     ThreadState: "state/1",
@@ -109,8 +112,10 @@ class Header(msgspec.Struct, frozen=True):
     period_ns: _Count = 0
     """Of raw arrays: time until the next frame is due; 0 where nothing is promised."""
     dtype: _Name = ""
-    shapes: Annotated[list[list[_Side]], msgspec.Meta(max_length=2)] = []
+    shapes: Annotated[list[list[_Side]], msgspec.Meta(max_length=2 + 2 * MOST_THREADS)] = []
     """Of the arrays in the payload, one after another."""
+    threads: Annotated[list[_Name], msgspec.Meta(max_length=MOST_THREADS)] = []
+    """Whose own fields follow, left and right of each, on the field of all."""
 
 
 def encoding_of(kind: type[Any]) -> str:
@@ -124,11 +129,13 @@ def encode(message: object, publisher: str = "", number: int = 0, sent_ns: int =
     """A message as bytes; the arguments beside it go into its header."""
     kind = type(message)
     if isinstance(message, StereoFrame | RidgeField):
-        views = [np.ascontiguousarray(v, _RAW[kind][1]) for v in (message.left, message.right)]
+        own = message.own if isinstance(message, RidgeField) else {}
+        pairs = (message.left, message.right), *own.values()
+        views = [np.ascontiguousarray(v, _RAW[kind][1]) for v in itertools.chain(*pairs)]
         stamp = (message.stamp.frame, message.stamp.capture_ns, message.stamp.released_ns)
         shapes = [list(v.shape) for v in views]
         dtype, period_ns = views[0].dtype.str, message.stamp.period_ns
-        header = Header(publisher, number, sent_ns, stamp, period_ns, dtype, shapes)
+        header = Header(publisher, number, sent_ns, stamp, period_ns, dtype, shapes, list(own))
         payload = b"".join(view.data for view in views)
     else:
         header = Header(publisher, number, sent_ns)
@@ -168,18 +175,21 @@ def _decode_raw(packet: Packet, kind: type[Any], header: Header) -> Any:
     dtype = _RAW[kind][1]
     if header.dtype != dtype.str:
         raise WireError(f"dtype {header.dtype!r}, expected {dtype.str!r}")
-    if header.stamp is None or len(header.shapes) != 2:
+    if header.stamp is None or len(header.shapes) != 2 + 2 * len(header.threads):
         raise WireError("the header lacks the stamp or the two shapes")
     sizes = [math.prod(shape) for shape in header.shapes]
     if len(packet.payload) != sum(sizes) * dtype.itemsize:
         raise WireError(f"{len(packet.payload)} bytes for shapes {header.shapes} of {dtype}")
+    if len(set(header.threads)) < len(header.threads):
+        raise WireError("the header names a thread twice")
     data = np.frombuffer(bytes(packet.payload), dtype)
-    left, right = np.split(data, [sizes[0]])
-    return kind(
-        Stamp(*header.stamp, header.period_ns),
-        left.reshape(header.shapes[0]),
-        right.reshape(header.shapes[1]),
-    )
+    parts = np.split(data, np.cumsum(sizes)[:-1])
+    left, right, *rest = (p.reshape(s) for p, s in zip(parts, header.shapes, strict=True))
+    stamp = Stamp(*header.stamp, header.period_ns)
+    if not rest:
+        return kind(stamp, left, right)
+    own = dict(zip(header.threads, zip(rest[::2], rest[1::2], strict=True), strict=True))
+    return kind(stamp, left, right, own)
 
 
 def _decode_small(packet: Packet, kind: type[Any]) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -21,10 +20,20 @@ from suturetrack.contrast import (
 )
 from suturetrack.kernels import ridge
 from suturetrack.silhouette import is_cut_out, silhouette_scale, silhouettes
-from suturetrack.types import Float32, Float64, Image, InputError, RidgeField, Seed, StereoFrame
+from suturetrack.types import (
+    Float32,
+    Float64,
+    Image,
+    InputError,
+    RidgeField,
+    Seed,
+    Stamp,
+    StereoFrame,
+)
 
 Channel = Literal["learned", "gray", "blue", "green", "red"]
 Polarity = Literal["auto", "dark", "bright", "both"]
+_Pair = tuple[Float32, Float32]
 
 _WEIGHTS = {
     "learned": GRAY,
@@ -44,8 +53,6 @@ _PULL, _ADAPT = 0.1, 0.2
 _FADE = 0.5
 # Fewest pixels of a curve from which contrast is learned.
 _FEWEST_PIXELS = 8
-# Worth of a mix in which some threads are dark and others bright, so that both must be looked for.
-_BOTH_SIGNS = 0.5
 # Least automatic c, grey levels: what a flawless picture's rounding makes.
 _LEAST_C = 1.0
 
@@ -87,7 +94,9 @@ class SegmentationConfig:
 class Segmenter:
     """Turns stereo frames into ridge vector fields.
 
-    The buffers of a field are used again four steps later; who keeps a field longer copies it.
+    Each learned thread is looked for in a field of its own; of several, the longest vectors make the
+    field of all. The buffers of a field are used again four steps later; who keeps a field longer
+    copies it.
     """
 
     def __init__(self, rig: StereoRig, config: SegmentationConfig = SegmentationConfig()) -> None:
@@ -96,9 +105,9 @@ class Segmenter:
         self._threads: dict[str, Contrast] = {}
         self._clear: dict[str, Contrast] = {}
         """As they were when they were seen last."""
-        self._look = _first_look(config)
-        width, height = rig.image_size
-        self._views = _View(height, width, config), _View(height, width, config)
+        self._first = _Sight(rig, config, _first_look(config))
+        self._sights: dict[str, _Sight] = {}
+        self._all: _Pair | None = None
         self._steps = 0
         self._is_cut_out = False
 
@@ -117,21 +126,18 @@ class Segmenter:
         frame = self._seen(frame)
         slot = self._steps % _SLOTS
         self._steps += 1
-        left, right = self._views
-        left.see(frame.left, self._look)
-        right.see(frame.right, self._look)
-        planes = self._rig.rectify(left.plane, right.plane, out=(left.rectified, right.rectified))
+        own = {name: sight.step(frame, slot) for name, sight in self._sights.items()}
+        if len(own) > 1:
+            return RidgeField(frame.stamp, *self._longest(list(own.values()), slot), own)
         return RidgeField(
-            frame.stamp,
-            left.filter(planes[0], self._look, slot),
-            right.filter(planes[1], self._look, slot),
+            frame.stamp, *(own.popitem()[1] if own else self._first.step(frame, slot))
         )
 
     def learn(self, frame: StereoFrame, seed: Seed) -> None:
         """Learn at `seed` what tells its thread from the surroundings: colours, width, contrast.
 
-        A seed with no ridge within 8 px teaches nothing. Of several threads, the mix suits all. Where
-        the thread was cut out of its picture, only its outline counts from then on.
+        A seed with no ridge within 8 px teaches nothing. Where the thread was cut out of its picture,
+        only its outline counts from then on.
 
         Raises:
             InputError: as `step`, or the seed lies outside the left image.
@@ -146,15 +152,14 @@ class Segmenter:
         if contrast is not None:
             if self._is_cut_out:
                 contrast = replace(contrast, sigma=max(silhouette_scale(frame.left), SIGMAS[0]))
-            self._threads[seed.thread] = self._clear[seed.thread] = contrast
-            self._relook()
+            self._clear[seed.thread] = contrast
+            self._look_for(seed.thread, contrast)
 
     def forget(self, thread: str) -> None:
         """Look for a thread no more; without any, look as before the first was learned."""
         if self._threads.pop(thread, None) is not None:
-            del self._clear[thread]
+            del self._clear[thread], self._sights[thread]
             self._is_cut_out &= bool(self._threads)
-            self._relook()
 
     def adapt(self, frame: StereoFrame, pixels: Float64, thread: str = "0") -> None:
         """Follow slow changes of the light: go a part of the way to what a held curve shows.
@@ -181,8 +186,8 @@ class Segmenter:
         nearer = min(old, clear, key=lambda contrast: abs(contrast.strength - seen.strength))
         followed = nearer.follow(seen, _ADAPT)
         if followed is not nearer:
-            self._threads[thread] = self._clear[thread] = followed
-            self._relook()
+            self._clear[thread] = followed
+            self._look_for(thread, followed)
 
     def fade(self, thread: str = "0") -> None:
         """Look for a thread that is lost as if it stood out less than before, down to a quarter of what
@@ -192,16 +197,16 @@ class Segmenter:
         """
         if not self._config.adapt or thread not in self._threads:
             return
-        self._threads[thread] = self._threads[thread].fainter(_FADE, self._clear[thread])
-        self._relook()
+        self._look_for(thread, self._threads[thread].fainter(_FADE, self._clear[thread]))
 
     def warm_up(self) -> None:
         """Compile (or load) the kernels, so that the first frame is as quick as the next."""
         width, height = self._rig.image_size
+        sight = _Sight(self._rig, self._config, self._first.look)
         for shape in ((height, width, 3), (height, width)):
-            view = _View(height, width, self._config)
-            view.see(np.zeros(shape, np.uint8), self._look)
-            view.filter(view.plane, self._look, 0)
+            black = np.zeros(shape, np.uint8)
+            field = sight.step(StereoFrame(Stamp(0, 0, 0), black, black), 0)
+            ridge.keep_longer(field[0], field[1])
 
     def _check(self, frame: StereoFrame) -> None:
         width, height = self._rig.image_size
@@ -231,9 +236,25 @@ class Segmenter:
             )
         return float(u), float(v)
 
-    def _relook(self) -> None:
-        threads = list(self._threads.values())
-        self._look = _learned_look(self._config, threads) if threads else _first_look(self._config)
+    def _look_for(self, thread: str, contrast: Contrast) -> None:
+        self._threads[thread] = contrast
+        look = _learned_look(self._config, contrast)
+        if thread in self._sights:
+            self._sights[thread].look = look
+        else:
+            self._sights[thread] = _Sight(self._rig, self._config, look)
+
+    def _longest(self, fields: list[_Pair], slot: int) -> _Pair:
+        width, height = self._rig.image_size
+        if self._all is None:
+            left, right = np.empty((2, _SLOTS, height, width, 2), np.float32)
+            self._all = left, right
+        left, right = self._all[0][slot], self._all[1][slot]
+        for out, views in zip((left, right), zip(*fields, strict=True), strict=True):
+            np.copyto(out, views[0])
+            for view in views[1:]:
+                ridge.keep_longer(view, out)
+        return left, right
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +269,7 @@ class _Look:
     signs: tuple[float, float]
     """See `ridge.ridge_field`."""
     across: Float64 | None = None
-    """(threads, 3) of `Contrast.across`; None until a thread is learned."""
+    """(3,) of `Contrast.across`; None until a thread is learned."""
 
     def mix(self, means: Float64) -> tuple[Float32, float | None]:
         """The weights for an image with such means, and c, if it was learned.
@@ -259,7 +280,7 @@ class _Look:
         weights = np.rint(weights / np.abs(weights).sum() * 256) / 256
         c = None
         if self.across is not None:
-            c = float(np.abs(self.across * means @ weights).min()) / 2
+            c = abs(float(self.across * means @ weights)) / 2
         return weights.astype(np.float32), c
 
 
@@ -268,32 +289,33 @@ def _first_look(config: SegmentationConfig) -> _Look:
     return _Look(_WEIGHTS[config.channel], False, sigmas, _SIGNS[config.polarity])
 
 
-def _learned_look(config: SegmentationConfig, threads: list[Contrast]) -> _Look:
-    signs, relative = _SIGNS[config.polarity], config.channel == "learned"
-    weights = _joint_mix(threads, config.polarity) if relative else _WEIGHTS[config.channel]
-    across = np.array([t.across for t in threads])
-    shown = across @ weights
-    if config.polarity == "auto" and (shown < 0).any():
-        signs = _SIGNS["bright" if (shown < 0).all() else "both"]
-    sigmas = config.sigmas or tuple(sorted({t.sigma for t in threads}))
-    return _Look(weights, relative, sigmas, signs, across)
+def _learned_look(config: SegmentationConfig, thread: Contrast) -> _Look:
+    signs, sigmas = _SIGNS[config.polarity], config.sigmas or (thread.sigma,)
+    if config.channel == "learned":
+        weights = -thread.weights if config.polarity == "bright" else thread.weights
+        return _Look(weights, True, sigmas, signs, thread.across)
+    weights = _WEIGHTS[config.channel]
+    if config.polarity == "auto" and thread.across @ weights < 0:
+        signs = _SIGNS["bright"]
+    return _Look(weights, False, sigmas, signs, thread.across)
 
 
-def _joint_mix(threads: list[Contrast], polarity: Polarity) -> Float64:
-    """The mix in which the thread that stands out least stands out most."""
-    if polarity == "bright":
-        return -_joint_mix(threads, "dark")
-    ways = itertools.product(*[(1.0,)] + [(1.0, 0.0, -1.0)] * (len(threads) - 1))
-    own = [t.weights / math.sqrt(t.weights @ t.clutter @ t.weights) for t in threads]
-    mixes = [np.tensordot(way, own, 1) for way in ways] + own
+class _Sight:
+    """One look at both views."""
 
-    def least(mix: Float64) -> float:
-        shown = np.array([t.stands_out(mix) for t in threads])
-        if (shown > 0).all():
-            return float(shown.min())
-        return _BOTH_SIGNS * float(np.abs(shown).min()) if polarity in ("auto", "both") else 0.0
+    def __init__(self, rig: StereoRig, config: SegmentationConfig, look: _Look) -> None:
+        width, height = rig.image_size
+        self._rig = rig
+        self._views = _View(height, width, config), _View(height, width, config)
+        self.look = look
 
-    return np.asarray(max(mixes, key=least))
+    def step(self, frame: StereoFrame, slot: int) -> _Pair:
+        """Both fields of a frame, in the slot's buffers."""
+        left, right = self._views
+        left.see(frame.left, self.look)
+        right.see(frame.right, self.look)
+        planes = self._rig.rectify(left.plane, right.plane, out=(left.rectified, right.rectified))
+        return left.filter(planes[0], self.look, slot), right.filter(planes[1], self.look, slot)
 
 
 class _View:

@@ -7,7 +7,8 @@ nanoseconds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -63,6 +64,14 @@ class RidgeField:
     """(H, W, 2) float32, components along (u, v)."""
     right: Float32
     """As `left`."""
+    own: Mapping[str, tuple[Float32, Float32]] = field(default_factory=dict)
+    """Of several threads, by name: left and right as they look for that thread alone. `left` and
+    `right` then show all of them."""
+
+    def of(self, thread: str) -> RidgeField:
+        """Where to look for a thread: the field of its own, if there is one."""
+        own = self.own.get(thread)
+        return self if own is None else RidgeField(self.stamp, *own)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import pytest
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.tracking import Tracker
-from suturetrack.tracking.crowding import crowded
+from suturetrack.tracking.crowding import covered, crowded
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
 from suturetrack.types import RidgeField, Seed, Status
@@ -66,10 +66,29 @@ def test_a_known_strand_crowds_the_thread_although_both_are_one_ridge(rig: Stere
     there[:, 1] += 2.0 * 200.0 / rig.focal
     both = views(rig, there, np.gradient(there, axis=0))
     seen = np.ones(len(there), bool)
-    others = Strand.other(both[0], seen), Strand.other(both[1], seen)
+    others = Neighbours(((Strand.other(both[0], seen), Strand.other(both[1], seen)),))
     found = flags(rig, paint(rig, [thread], 0), thread, others)
     assert found[55:].all()
     assert not found[:45].any()
+
+
+def test_a_known_strand_that_the_field_does_not_show_leaves_the_thread_alone(
+    rig: StereoRig,
+) -> None:
+    thread, other = line((-25, 0), (25, 0)), line((-25, -6), (25, 6))
+    both = views(rig, other, np.gradient(other, axis=0))
+    strands = tuple(Strand.other(view, np.ones(len(other), bool)) for view in both)
+    known = Neighbours(((strands[0], strands[1]),))
+    alone, beside = paint(rig, [thread], 0), paint(rig, [thread, other], 0)
+    assert known.shown_in(alone, LEVELS).threads == ()
+    assert known.shown_in(beside, LEVELS).threads == known.threads
+    assert flags(rig, beside, thread, known.shown_in(beside, LEVELS)).any()
+    assert not flags(rig, alone, thread, known.shown_in(alone, LEVELS)).any()
+    samples = views(rig, thread, np.gradient(thread, axis=0) * len(thread))
+    hidden = covered(samples, known)
+    away = np.abs(rig.focal / 200.0 * (other - thread)[:, 1])
+    assert hidden[away < 3.0].all()
+    assert not hidden[away > 6.0].any()
 
 
 def test_an_arc_does_not_slip_onto_the_line_that_cuts_it(rig: StereoRig) -> None:

@@ -10,6 +10,7 @@ import sys
 import textwrap
 import time
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -79,21 +80,23 @@ def frame() -> StereoFrame:
     return StereoFrame(STAMP, *smooth)
 
 
-@pytest.fixture
-def ridges() -> RidgeField:
-    rng = np.random.default_rng(2)
-    return RidgeField(STAMP, *rng.normal(0, 0.3, (2, 480, 640, 2)).astype(np.float32))
+@pytest.fixture(params=[(), ("0", "left-hand")], ids=["one", "several"])
+def ridges(request: pytest.FixtureRequest) -> RidgeField:
+    rng, own = np.random.default_rng(2), request.param
+    views = rng.normal(0, 0.3, (1 + len(own), 2, 480, 640, 2)).astype(np.float32)
+    return RidgeField(STAMP, *views[0], dict(zip(own, map(tuple, views[1:]), strict=True)))
 
 
 def test_full_images_and_fields_come_back_to_the_bit_though_buffers_are_used_again(
     tmp_path: Path, rig: StereoRig, frame: StereoFrame, ridges: RidgeField
 ) -> None:
     images = {"left": frame.left.copy(), "right": frame.right.copy()}
-    fields = {"left": ridges.left.copy(), "right": ridges.right.copy()}
+    pairs = [(ridges.left, ridges.right), *ridges.own.values()]
+    fields = np.copy(pairs)
     with Recorder(tmp_path, "source", "full", rig) as recorder:
         recorder.frame(frame, PUBLISHED)
         recorder.field(ridges, PUBLISHED)
-        for buffer in (frame.left, frame.right, ridges.left, ridges.right):
+        for buffer in (frame.left, frame.right, *chain(*pairs)):
             buffer[:] = 0
     folder = RunFolder(tmp_path)
     for view in ("left", "right"):
@@ -105,8 +108,8 @@ def test_full_images_and_fields_come_back_to_the_bit_though_buffers_are_used_aga
     assert np.array_equal(again.right, images["right"])
     (field,) = folder.fields()
     assert field.left.dtype == np.float32
-    assert np.array_equal(field.left, fields["left"])
-    assert np.array_equal(field.right, fields["right"])
+    assert list(field.own) == list(ridges.own)
+    assert np.array_equal([(field.left, field.right), *field.own.values()], fields)
 
 
 def test_light_images_are_close_and_in_the_right_colours(

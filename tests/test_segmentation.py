@@ -476,6 +476,37 @@ def test_threads_of_different_colours_are_seen_together() -> None:
     assert strength[75:90, 20:140].mean() < 0.05
 
 
+@pytest.mark.parametrize("other", [(250, 200, 120), (170, 90, 90)])
+def test_each_of_several_threads_has_a_field_in_which_it_stands_out(
+    other: tuple[int, int, int],
+) -> None:
+    """A dark violet thread beside a bright blue, or a faint violet one."""
+    image = np.full((161, 161, 3), (60, 60, 190), np.uint8)
+    for row, colour in ((50, (150, 40, 70)), (110, other)):
+        cv2.line(image, (0, row), (160, row), colour, 2, cv2.LINE_AA)
+    noise = np.random.default_rng(0).normal(0, 2, (2, *image.shape))
+    frame = StereoFrame(STAMP, *np.clip(image + noise, 0, 255).astype(np.uint8))
+    seeds = Seed("a", pixel=(80.0, 50.0)), Seed("b", pixel=(80.0, 110.0))
+    segmenter = Segmenter(small_rig(161, 161))
+    segmenter.learn(frame, seeds[0])
+    assert not segmenter.step(frame).own
+    segmenter.learn(frame, seeds[1])
+    field = segmenter.step(frame)
+    for i, seed in enumerate(seeds):
+        alone = Segmenter(small_rig(161, 161))
+        alone.learn(frame, seed)
+        only, own = alone.step(frame), field.of(seed.thread)
+        assert np.array_equal(own.left, only.left)
+        assert np.array_equal(own.right, only.right)
+        shown = np.linalg.norm(own.left, axis=-1)[[50, 110], 20:140].mean(1)
+        assert shown[i] > 0.4
+    for side, view in enumerate((field.left, field.right)):
+        own = [views[side] for views in field.own.values()]
+        assert np.array_equal(view, reference.strongest(own))
+    segmenter.forget("a")
+    assert segmenter.step(frame).left.tobytes() == only.left.tobytes()
+
+
 @pytest.mark.parametrize("number", [221, 222])
 def test_threads_that_cross_near_a_seed_are_seen_together(number: int) -> None:
     """Half of the ridge that runs on from one of the seeds is the other thread, of another colour."""

@@ -83,7 +83,7 @@ def test_another_thread_that_is_held_is_no_stranger(rig: StereoRig) -> None:
     for i, field in enumerate(shown):
         other = line(6.0 * 3 * i / round(SECONDS * FPS))
         left, right = views(rig, other, np.gradient(other, axis=0))
-        others = Strand.other(left, seen), Strand.other(right, seen)
+        others = Neighbours(((Strand.other(left, seen), Strand.other(right, seen)),))
         curve = curve_through(line())
         strangers = strangers.step(curve, np.ones(64, bool), field, rig, LEVELS, others)
         assert not strangers.is_found

@@ -382,6 +382,47 @@ def test_two_threads_keep_their_names(rig: StereoRig) -> None:
     assert [s.thread for s in tracker.step(paint(rig, pair, 21)).states] == [kept.thread] == ["b"]
 
 
+def test_a_thread_is_followed_in_the_field_of_its_own(rig: StereoRig) -> None:
+    """Two threads meet and part again, as if they had passed through one another."""
+    y, worst = np.linspace(-25, 25, 400), {}
+    for apart in (False, True):
+        tracker, errors = Tracker(rig), []
+        for i in range(60):
+            lift = 3.0 * abs(np.cos(2 * np.pi * i / 60))
+            pair = [np.c_[sign * (0.03 * y + lift), y, np.full(400, 200.0)] for sign in (-1, 1)]
+            field = paint(rig, pair, i)
+            own = {name: paint(rig, [points], i) for name, points in zip("ab", pair, strict=True)}
+            if apart:
+                field = replace(field, own={name: (f.left, f.right) for name, f in own.items()})
+            if i == 0:
+                for name, points in zip("ab", pair, strict=True):
+                    tracker.seed(seed_on(rig, points, name))
+            states = tracker.step(field).states
+            errors += [error(s, t).p95 for s, t in zip(states, pair, strict=True)]
+        worst[apart] = max(errors)
+    assert worst[True] < 0.15
+    assert worst[False] > 3 * worst[True]
+
+
+def test_an_end_beneath_another_thread_is_no_shorter(rig: StereoRig) -> None:
+    """Its own field shows nothing where the other thread lies over it."""
+    x = np.linspace(-25, 25, 400)
+    below = np.c_[x, 0.02 * x**2, np.full(400, 200.0)]
+    tracker, lengths = Tracker(rig), []
+    for i in range(90):
+        above = np.c_[np.full(400, max(45.0 - i, 24.0)), x + 12.0, np.full(400, 198.0)]
+        above[:, 0] += 0.1 * x
+        hidden = np.linalg.norm(below[:, None, :2] - above[::4, :2], axis=2).min(axis=1) < 0.6
+        field = paint(rig, [below, above], i)
+        own = {"a": paint(rig, [below[~hidden]], i), "b": paint(rig, [above], i)}
+        field = replace(field, own={name: (f.left, f.right) for name, f in own.items()})
+        if i == 0:
+            tracker.seed(seed_on(rig, below, "a"))
+            tracker.seed(seed_on(rig, above, "b"))
+        lengths.append(tracker.step(field).states[0].length)
+    assert np.abs(np.array(lengths[1:]) / metrics.polyline_length(below) - 1).max() < 0.01
+
+
 def test_a_thread_that_is_seeded_again_keeps_its_direction(rig: StereoRig) -> None:
     points = thread(0.0)
     tracker, states = Tracker(rig), []

@@ -70,9 +70,9 @@ def frame(shape: tuple[int, ...] = (48, 64, 3)) -> StereoFrame:
     return StereoFrame(STAMP, left, right)
 
 
-def field(shape: tuple[int, ...] = (48, 64, 2)) -> RidgeField:
-    left, right = RNG.uniform(-0.7, 0.7, (2, *shape)).astype(np.float32)
-    return RidgeField(STAMP, left, right)
+def field(shape: tuple[int, ...] = (48, 64, 2), own: tuple[str, ...] = ()) -> RidgeField:
+    views = RNG.uniform(-0.7, 0.7, (1 + len(own), 2, *shape)).astype(np.float32)
+    return RidgeField(STAMP, *views[0], dict(zip(own, map(tuple, views[1:]), strict=True)))
 
 
 LATENCY = Latency(1.0, 2.0, 3.0)
@@ -82,6 +82,7 @@ MESSAGES: list[Any] = [
     frame(),
     frame((48, 64)),
     field(),
+    field(own=("0", "left-hand")),
     state(),
     state(status=Status.LOST, curve=None, length=math.nan, energies=Energies(), events=("lost",)),
     state(sigma=np.array([0.1, np.inf]), seen=np.zeros(2, bool)),
@@ -112,6 +113,14 @@ def assert_same(a: Any, b: Any) -> None:
     if dataclasses.is_dataclass(a):
         for part in dataclasses.fields(a):
             assert_same(getattr(a, part.name), getattr(b, part.name))
+    elif isinstance(a, dict):
+        assert list(a) == list(b)
+        for key in a:
+            assert_same(a[key], b[key])
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_same(x, y)
     elif isinstance(a, np.ndarray):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
@@ -219,6 +228,26 @@ def test_headers_that_lie_are_refused(changes: dict[str, Any], reason: str) -> N
     refused(header_of(wire.encode(frame()), **changes), StereoFrame, reason)
 
 
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"threads": []}, "two shapes"),
+        ({"threads": ["0", "1", "2"]}, "two shapes"),
+        ({"threads": ["0", "0"]}, "twice"),
+        ({"threads": ["0", 7]}, "threads"),
+        ({"threads": ["0", "x" * 1000]}, "threads"),
+        ({"threads": ["0"] * 1000}, "threads"),
+        ({"shapes": [[48, 64, 2]] * 4 + [[48, 64, 2], [64, 48, 2]]}, "field of thread 1 is"),
+        ({"shapes": [[48, 64, 2]] * 1000}, "shapes"),
+    ],
+)
+def test_headers_that_lie_of_single_threads_are_refused(
+    changes: dict[str, Any], reason: str
+) -> None:
+    packet = wire.encode(field(own=("0", "1")))
+    refused(header_of(packet, **changes), RidgeField, reason)
+
+
 @dataclass(frozen=True)
 class Huge:
     """A payload that must be refused by its size, without being read."""
@@ -240,9 +269,10 @@ def test_a_payload_of_hostile_size_is_not_even_read() -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1.5])
 def test_fields_hold_only_unit_components(bad: float) -> None:
-    broken = field()
-    broken.right[5, 6, 1] = bad
-    refused(wire.encode(broken), RidgeField, r"\[-1, 1\]")
+    broken, of_a_thread = field(), field(own=("0",))
+    broken.right[5, 6, 1] = of_a_thread.own["0"][1][5, 6, 1] = bad
+    for message in (broken, of_a_thread):
+        refused(wire.encode(message), RidgeField, r"\[-1, 1\]")
 
 
 def with_points(value: float) -> Nurbs:

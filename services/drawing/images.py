@@ -62,11 +62,14 @@ def frame(frame: StereoFrame, level: Level) -> Iterator[Entry]:
 
 def field(field: RidgeField, rig: StereoRig, level: Level) -> Iterator[Entry]:
     """The direction fields in false colour over the raw image; as numbers too (full)."""
-    for view, vectors in zip(VIEWS, (field.left, field.right), strict=True):
+    for side, (view, vectors) in enumerate(zip(VIEWS, (field.left, field.right), strict=True)):
         picture = unrectified(direction_image(vectors), rig, view)
         yield f"/rig/{view}/image/direction", jpeg(picture)
         if level == "full":
-            numbers = {"shape": vectors.shape, "vectors": vectors}
+            every = np.stack([vectors, *(pair[side] for pair in field.own.values())])
+            numbers: dict[str, Any] = {"shape": every.shape, "vectors": every}
+            if field.own:
+                numbers["threads"] = list(field.own)
             yield f"/rig/{view}/field", values("RidgeField", numbers)
 
 

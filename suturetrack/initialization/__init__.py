@@ -70,7 +70,7 @@ def _initialize_from_afar(
     field: RidgeField, rig: StereoRig, pixel: Float64, config: InitializationConfig, scale: int
 ) -> Initialization:
     """A wide thread is looked at from farther away: all that follows is made for a narrow one."""
-    reduced = RidgeField(field.stamp, *(_reduced(v, scale) for v in (field.left, field.right)))
+    reduced = RidgeField(field.stamp, _reduced(field.left, scale), _reduced(field.right, scale))
     try:
         left = find_ridges(reduced.left, config)
         found = _initialize(reduced, left, rig.reduced(scale), pixel / scale, config, scale)

@@ -102,6 +102,18 @@ def ridge_field(
 
 
 @njit(cache=True, **_fast)
+def keep_longer(vectors: Float32, out: Float32) -> None:
+    """At every pixel of (H, W, 2) fields, the longer of both vectors into `out`."""
+    for y in range(len(out)):
+        row, kept = vectors[y], out[y]
+        for x in range(len(kept)):
+            u, v, p, q = row[x, 0], row[x, 1], kept[x, 0], kept[x, 1]
+            is_longer = u * u + v * v > p * p + q * q
+            kept[x, 0] = u if is_longer else p
+            kept[x, 1] = v if is_longer else q
+
+
+@njit(cache=True, **_fast)
 def _hessian_row(
     plane: Float32,
     row: int,

@@ -33,13 +33,23 @@ def crowded(
         both: the samples as predicted, left and right.
         share: (k,) part of the curve that each stands for.
         levels: response of a clear view of the thread, left and right.
-        neighbours: other threads, left and right.
+        neighbours: other threads.
     """
     images = field.left, field.right
     flags = np.zeros(len(share), bool)
-    for image, view, level, others in zip(images, both, levels, neighbours, strict=True):
+    for image, view, level, others in zip(images, both, levels, neighbours.both, strict=True):
         flags |= _beside(image, view, share, level, others)
     return _closed(flags, both[0].speed * share)
+
+
+def covered(both: tuple[View, View], neighbours: Neighbours) -> Bool:
+    """(k,) samples on which another thread lies, or which lie on it, in either image."""
+    here: Float64 = np.zeros(1)
+    left, right = (
+        search.covered(view.pixels, view.tangents, here, others.pixels, _NEAR_PX)[:, 0]
+        for view, others in zip(both, neighbours.both, strict=True)
+    )
+    return left | right
 
 
 def _beside(image: Float32, view: View, share: Float64, level: float, others: Strand) -> Bool:

@@ -14,6 +14,7 @@ from suturetrack.tracking import gauss_newton, paper
 from suturetrack.tracking.alignment import shifted, shown
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange
+from suturetrack.tracking.crowding import covered
 from suturetrack.tracking.ends import EndStep, EndWatch, find_end
 from suturetrack.tracking.energies import energies
 from suturetrack.tracking.folds import doubled_ends
@@ -120,7 +121,7 @@ class Follower:
         """Whether it has been uncertain for more than a moment where the thread runs."""
         return (self.model.capture_ns - self._certain_ns) * _NS > _PATIENCE_S
 
-    def strands(self, capture_ns: int) -> Neighbours:
+    def strands(self, capture_ns: int) -> tuple[Strand, Strand]:
         """What is seen of the thread, where it should be at that time: others keep clear of it."""
         model = self.model
         curve = model.motion.predict(model.curve, (capture_ns - model.capture_ns) * _NS)
@@ -130,7 +131,7 @@ class Follower:
         return Strand.other(both[0], seen), Strand.other(both[1], seen)
 
     def step(self, field: RidgeField, thread: str, neighbours: Neighbours = NOBODY) -> ThreadState:
-        """The thread in the next field; `neighbours` are the strands of other threads."""
+        """The thread in the next field; `neighbours` are other threads."""
         model = self.model
         seconds = (field.stamp.capture_ns - model.capture_ns) * _NS
         if self._lost or self._short:
@@ -297,10 +298,11 @@ class Follower:
         self, field: RidgeField, predicted: Nurbs, neighbours: Neighbours
     ) -> tuple[Evidence, int, int]:
         model = self.model
-        best = self._search(predicted, field, neighbours)
+        best = self._search(predicted, field, neighbours.shown_in(field, model.levels))
         model.curve = best.fit.curve
         if best.share > 0.3:
-            self._adjust_ends(field, best.fit.crowded)
+            hidden = covered(best.fit.views(self.rig), neighbours)
+            self._adjust_ends(field, best.fit.crowded | hidden)
         self._cut_doubled_ends()
         model.curve, inserted, removed = rearrange(model.curve, self.rig)
         return best, inserted, removed

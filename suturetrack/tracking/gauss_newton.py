@@ -75,6 +75,11 @@ class Fit:
     crowded: Bool
     """(k,) where another ridge runs close beside the thread."""
 
+    def views(self, rig: StereoRig) -> tuple[View, View]:
+        """The samples on the fitted curve, in both images."""
+        points = self.curve.control_points
+        return views(rig, self.samples.values(points), self.samples.values(points, 1))
+
 
 def search_normals(
     image: Float32,
@@ -112,7 +117,7 @@ def fit(
         predicted: cubic, parametrised like its arc length.
         levels: response of a clear view of the thread, left and right.
         reach_px: how far along the normals the thread is looked for at first.
-        neighbours: other threads, left and right.
+        neighbours: other threads that the field shows.
     """
     samples = Samples.of(predicted.knots, config.samples_per_span)
     reference = _Reference.of(samples, predicted)
@@ -229,7 +234,7 @@ class _Linearized:
         left, right = (
             search_normals(image, view, samples.share, level, reach_px, others)
             for image, view, level, others in zip(
-                (field.left, field.right), self.views, levels, neighbours, strict=True
+                (field.left, field.right), self.views, levels, neighbours.both, strict=True
             )
         )
         self.offsets = left, right

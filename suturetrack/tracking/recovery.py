@@ -111,7 +111,7 @@ def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
     s: Float64 = np.linspace(0, 1, 4 * _PLACES)
     alone = np.zeros(len(s), bool)
     for view, strand in zip(
-        views(rig, evaluate(curve, s), tangents(curve, s)), others, strict=True
+        views(rig, evaluate(curve, s), tangents(curve, s)), others.both, strict=True
     ):
         own = Strand(view.pixels, view.tangents, np.zeros(len(s)))
         alone |= ~search.doubled(own.arrays, strand.arrays, 0.0, search.APART_PX)

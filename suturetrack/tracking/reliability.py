@@ -83,13 +83,12 @@ class Evidence:
         on another strand in an image, with a strand beside it that is nobody's. It is plainly on the
         thread where it is seen and lies on no other strand.
         """
-        samples, points = self.fit.samples, self.fit.curve.control_points
-        both = views(rig, samples.values(points), samples.values(points, 1))
+        both, share = self.fit.views(rig), self.fit.samples.share
         unseen, left_alone, plain = ~self.seen, np.zeros(len(self.seen), bool), self.seen.copy()
         for image, view, level, others in zip(
-            (field.left, field.right), both, levels, neighbours, strict=True
+            (field.left, field.right), both, levels, neighbours.both, strict=True
         ):
-            own = Strand.of(view, samples.share)
+            own = Strand.of(view, share)
             all_seen = own.where(self.seen).joined(others)
             on_another = search.doubled(
                 own.arrays, all_seen.arrays, SAME_STRAND_PX, search.APART_PX

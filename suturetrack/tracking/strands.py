@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from suturetrack.kernels import search
 from suturetrack.tracking.sampling import View
-from suturetrack.types import Bool, Float64
+from suturetrack.types import Bool, Float32, Float64, RidgeField
 
 SAME_STRAND_PX = 45.0
 """What is nearer than this along a curve is no other strand of it; a tight knot is a point."""
+# Share of a clear view's response from which another thread draws the middle aside.
+_SHOWN = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +61,39 @@ class Strand:
         return self.pixels, self.tangents, self.along
 
 
-Neighbours = tuple[Strand, Strand]
-"""Other threads in the left and in the right image."""
-
 _NONE = Strand(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
-NOBODY: Neighbours = (_NONE, _NONE)
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """Other threads."""
+
+    threads: tuple[tuple[Strand, Strand], ...] = ()
+    """One by one, in the left and in the right image."""
+
+    @cached_property
+    def both(self) -> tuple[Strand, Strand]:
+        """All of them, in the left and in the right image."""
+        left, right = _NONE, _NONE
+        for thread in self.threads:
+            left, right = left.joined(thread[0]), right.joined(thread[1])
+        return left, right
+
+    def shown_in(self, field: RidgeField, levels: tuple[float, float]) -> Neighbours:
+        """Those that are seen in a field, which may be made for one thread.
+
+        Args:
+            levels: response of a clear view of that thread, left and right.
+        """
+        images = field.left, field.right
+        return Neighbours(
+            tuple(thread for thread in self.threads if any(map(_is_shown, thread, images, levels)))
+        )
+
+
+def _is_shown(strand: Strand, image: Float32, level: float) -> bool:
+    responses = search.responses(image, strand.pixels, strand.tangents)
+    return len(responses) > 0 and float(np.median(responses)) > _SHOWN * level
+
+
+NOBODY = Neighbours()

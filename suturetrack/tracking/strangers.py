@@ -69,7 +69,7 @@ class Strangers:
         Args:
             seen: at evenly spaced parameters.
             levels: response of a clear view of the thread, left and right.
-            others: other threads, left and right.
+            others: other threads.
         """
         now = field.stamp.capture_ns
         if self._past and 0 <= now - self._past[-1][0] < _PAUSE_NS:
@@ -91,7 +91,7 @@ class Strangers:
                 crop = _around(view.pixels, power.shape, _MARGIN * own_px)
                 corner = np.array([crop[1].start, crop[0].start], float)
                 near = replace(view, pixels=view.pixels - corner)
-                known = others[side].pixels - corner
+                known = others.both[side].pixels - corner
                 found = _branches(power[crop], stayed[crop], near, shown, known, own_px)
                 branches.append(found)
         suspected = len(branches) == 2 and bool((branches[0] & branches[1]).any())

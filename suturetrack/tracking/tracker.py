@@ -17,9 +17,9 @@ from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.looks import Look
 from suturetrack.tracking.recovery import Setup
 from suturetrack.tracking.searches import Closer, FromSeed
-from suturetrack.tracking.strands import NOBODY, Neighbours
+from suturetrack.tracking.strands import Neighbours
 from suturetrack.tracking.thread import Thread, not_found
-from suturetrack.types import RidgeField, Seed, Status, ThreadState
+from suturetrack.types import RidgeField, Seed, Stamp, Status, ThreadState
 
 FORGOTTEN = "forgotten"
 """Event of the last state of a thread that was dropped."""
@@ -115,7 +115,7 @@ class Tracker:
             held = {name for name, thread in self._threads.items() if thread.is_held}
             for thread in threads:
                 all_held = not self._threads.keys() - held - {thread.name}
-                thread.follow(dated, self._others(thread, dated), all_held)
+                thread.follow(dated.of(thread.name), self._others(thread, dated.stamp), all_held)
             done = [*self._go_on_looking(dated), *self._begin_to_look(dated, held)]
         states = [thread.state_at(field.stamp, is_new) for thread in threads]
         first = {look.thread: look for look in done if isinstance(look.search, FromSeed)}
@@ -131,8 +131,8 @@ class Tracker:
         if look is None:
             return
         thread = self._threads[look.thread]
-        others = self._others(thread, field)
-        look.add(self._worker, field, others)
+        others = self._others(thread, field.stamp)
+        look.add(self._worker, field.of(look.thread), others)
         if field.stamp.capture_ns >= look.due_ns:
             self._look = None
             thread.take_up(look, others)
@@ -151,24 +151,24 @@ class Tracker:
             search = thread.search(field.stamp.capture_ns, is_beside)
             if search is None:
                 continue
-            look, others = Look(search, field), self._others(thread, field)
+            own, others = field.of(thread.name), self._others(thread, field.stamp)
+            look = Look(search, own)
             if is_beside or isinstance(search, Closer):
-                look.add(self._worker, field, others)
+                look.add(self._worker, own, others)
                 self._look = look
             else:
                 look.at_once(others)
                 thread.take_up(look, others)
                 yield look
 
-    def _others(self, thread: Thread, field: RidgeField) -> Neighbours:
+    def _others(self, thread: Thread, stamp: Stamp) -> Neighbours:
         """The strands of the other threads that are held."""
-        left, right = NOBODY
-        for other in self._threads.values():
-            if other is thread or other.follower is None or not other.is_held:
-                continue
-            strands = other.follower.strands(field.stamp.capture_ns)
-            left, right = left.joined(strands[0]), right.joined(strands[1])
-        return left, right
+        held = [
+            other.follower
+            for other in self._threads.values()
+            if other is not thread and other.follower is not None and other.is_held
+        ]
+        return Neighbours(tuple(follower.strands(stamp.capture_ns) for follower in held))
 
     def _drop_look(self, thread: str) -> None:
         if self._look is not None and self._look.thread == thread:
