@@ -16,7 +16,9 @@ from suturetrack.initialization import Initialization, InitializationError, init
 from suturetrack.initialization.matching import raised
 from suturetrack.tracking import Tracker
 from suturetrack.tracking.follower import Follower
-from suturetrack.tracking.recovery import directed
+from suturetrack.tracking.recovery import directed, doubting_ends
+from suturetrack.tracking.sampling import views
+from suturetrack.tracking.strands import Neighbours, Strand
 from suturetrack.tracking.sureness import Sureness
 from suturetrack.types import RidgeField, Seed, Status, ThreadState
 from tests.painting import FPS, paint, thread
@@ -533,3 +535,30 @@ def test_what_was_taken_for_the_thread_since_does_not_tell_its_length_alone(
     assert states[plain_at].status is Status.OCCLUDED
     assert states[plain_at].length == pytest.approx(metrics.polyline_length(grown[-1]), rel=0.01)
     assert rms(states[-1], truth) < 0.1
+
+
+def test_an_end_that_runs_along_another_thread_leaves_a_look_in_doubt(rig: StereoRig) -> None:
+    x = np.linspace(-25, 25, 600)
+    points = np.c_[x, 0.01 * x**2, np.full(600, 200.0)]
+    found = initialize(paint(rig, [points], 0), rig, seed_on(rig, points))
+    found = replace(found, confidence=0.9, doubts=((), ()))
+
+    def beside(other: np.ndarray) -> Initialization:
+        both = views(rig, other, np.gradient(other, axis=0))
+        left, right = (Strand.other(view, np.ones(len(other), bool)) for view in both)
+        return doubting_ends(found, Neighbours(((left, right),)), rig)
+
+    along = points[450:] + np.array([0.0, 0.6, 0.0])
+    across = np.c_[np.full(600, 24.0), x + 6.0, np.full(600, 200.0)]
+    middle = points[200:400]
+    above = points[450:] * 0.9
+    for other in (across, middle, above):
+        assert beside(other).confidence == 0.9
+        assert beside(other).doubts == ((), ())
+    doubted = beside(along)
+    assert doubted.confidence == pytest.approx(0.27)
+    for view in doubted.doubts:
+        ((place, rest),) = view
+        assert rest == 0.3
+        end = nurbs.evaluate(doubted.curve, np.array([place]))[0]
+        assert np.linalg.norm(end - points[450]) < 1.5

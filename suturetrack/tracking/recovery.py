@@ -15,18 +15,22 @@ from suturetrack.initialization import (
     initialize,
 )
 from suturetrack.kernels import search
+from suturetrack.metrics import polyline_length
 from suturetrack.nurbs import evaluate, length, reversed_curve, tangents
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import Neighbours, Strand
-from suturetrack.types import Float64, Nurbs, RidgeField, Seed
+from suturetrack.types import Bool, Float64, Nurbs, RidgeField, Seed
 
 _PLACES = 24
 _SEEDS = 2
 _LENGTH_TOLERANCE = 0.05
 # Threads that lie on one another do so for less of their length.
 _SHARED = 0.3
+_EVENLY = np.linspace(0, 1, 4 * _PLACES)
+# How near and for how long an end may run along another thread, and what more leaves of the confidence.
+_BESIDE_PX, _LONGEST_PX, _DOUBTED = 5.0, 12.0, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,14 +112,32 @@ def length_error(curve: Nurbs, known_lengths: tuple[float, ...]) -> float:
 
 def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
     """Whether much of the curve lies on the strands of other threads, in both images."""
-    s: Float64 = np.linspace(0, 1, 4 * _PLACES)
-    alone = np.zeros(len(s), bool)
-    for view, strand in zip(
-        views(rig, evaluate(curve, s), tangents(curve, s)), others.both, strict=True
-    ):
-        own = Strand(view.pixels, view.tangents, np.zeros(len(s)))
-        alone |= ~search.doubled(own.arrays, strand.arrays, 0.0, search.APART_PX)
-    return bool(np.mean(~alone) > _SHARED)
+    return bool(np.mean(_shared(curve, others, rig, search.APART_PX)) > _SHARED)
+
+
+def doubting_ends(found: Initialization, others: Neighbours, rig: StereoRig) -> Initialization:
+    """The look, which is not sure by itself where an end runs on along another thread."""
+    shared = _shared(found.curve, others, rig, _BESIDE_PX)
+    spacing = polyline_length(rig.project(evaluate(found.curve, _EVENLY))[0]) / len(_EVENLY)
+    runs = [np.argmin(np.r_[flags, False]) for flags in (shared, shared[::-1])]
+    new = tuple(
+        (abs(end - float(_EVENLY[run])), _DOUBTED)
+        for end, run in enumerate(runs)
+        if run * spacing > _LONGEST_PX
+    )
+    left, right = found.doubts
+    confidence = found.confidence * _DOUBTED ** len(new)
+    return replace(found, confidence=confidence, doubts=((*left, *new), (*right, *new)))
+
+
+def _shared(curve: Nurbs, others: Neighbours, rig: StereoRig, near: float) -> Bool:
+    """(k,) where the curve runs along the strands of other threads, in both images."""
+    shared = np.ones(len(_EVENLY), bool)
+    both = views(rig, evaluate(curve, _EVENLY), tangents(curve, _EVENLY))
+    for view, strand in zip(both, others.both, strict=True):
+        own = Strand(view.pixels, view.tangents, np.zeros(len(_EVENLY)))
+        shared &= search.doubled(own.arrays, strand.arrays, 0.0, near)
+    return shared
 
 
 def directed(found: Initialization, last: Nurbs) -> Initialization:

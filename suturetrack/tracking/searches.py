@@ -11,6 +11,7 @@ from suturetrack.tracking.pursuit import Pursuit
 from suturetrack.tracking.recovery import (
     Setup,
     directed,
+    doubting_ends,
     find_again,
     has_length,
     length_error,
@@ -73,7 +74,9 @@ class Again:
         found = find_again(
             self.last, self.known_lengths, starts, field, self.setup, is_brief=is_brief
         )
-        return None if found is None or lies_on(found.curve, others, self.rig) else found
+        if found is None or lies_on(found.curve, others, self.rig):
+            return None
+        return doubting_ends(found, others, self.rig)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows the thread, with what was known of its length."""
@@ -102,7 +105,7 @@ class Closer:
         rig = self.setup.rig.with_row_offset(found.row_offset_px)
         if lies_on(found.curve, others, rig) or not has_length(found.curve, lengths(self.before)):
             return None
-        return directed(found, self.followed)
+        return directed(doubting_ends(found, others, rig), self.followed)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows what this look found."""
