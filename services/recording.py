@@ -125,7 +125,7 @@ class Recorder:
             self.passed(field.stamp, at)
         elif self._file is not None:
             self._pictured = field.stamp.capture_ns
-            copy = _copied(field)
+            copy = _copied(field if self._level == "full" else replace(field, own={}))
             self._hand_over(lambda file: file.field(copy, at))
 
     def states(self, states: Sequence[ThreadState], published_ns: int | None = None) -> None:

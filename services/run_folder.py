@@ -23,6 +23,7 @@ from services.messages import Forget
 from services.run_file import APPLICATION, RECORDING_VERSION
 from services.writer import Request
 from suturetrack.camera import Camera, StereoRig
+from suturetrack.segmentation import joined
 from suturetrack.types import (
     Energies,
     Float32,
@@ -142,7 +143,7 @@ class RunFolder:
         """All fields of a full recording in order, each read when it is asked for."""
         for stamp, left, right in self._pairs("field", _field):
             own = {name: (left[name], right[name]) for name in left if name}
-            yield RidgeField(stamp, left[""], right[""], own)
+            yield joined(stamp, own) if own else RidgeField(stamp, left[""], right[""])
 
     def _parsed(self, rows: Iterable[Row], parse: Callable[[Row], T], what: str) -> list[T]:
         """The values in the rows; what a newer version wrote in another form is left out."""
@@ -298,11 +299,11 @@ def _image(row: Row) -> Image | None:
 
 
 def _field(row: Row) -> dict[str, Float32] | None:
-    """The field of all threads, under no name, and those of single ones."""
+    """The fields of several threads, by name, or under no name that of all."""
     if "RidgeField:vectors" not in row:
         return None
-    vectors = row["RidgeField:vectors"].reshape(-1, *row["RidgeField:shape"][-3:])
-    return dict(zip(("", *row.get("RidgeField:threads", ())), vectors, strict=True))
+    vectors = row["RidgeField:vectors"].reshape(-1, *row["RidgeField:shape"])
+    return dict(zip(row.get("RidgeField:threads", ("",)), vectors, strict=True))
 
 
 def _part(file: Path) -> tuple[str, int]:

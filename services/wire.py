@@ -1,9 +1,9 @@
 """Types <-> bytes.
 
-Frames and fields travel as their raw arrays, left then right, then those of single threads; the header
-in the attachment gives shapes, dtype, stamp and threads. Everything else travels as MessagePack, arrays
-as nested lists. The encoding names the schema and its version: `application/octet-stream;frame/1`,
-`application/msgpack;state/1`. Lengths on the wire are in metres.
+Frames and fields travel as their raw arrays, left then right; those of several threads one after the
+other. The header in the attachment gives shapes, dtype, stamp and threads. Everything else travels as
+MessagePack, arrays as nested lists. The encoding names the schema and its version:
+`application/octet-stream;frame/1`, `application/msgpack;state/1`. Lengths on the wire are in metres.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from services.messages import (
     ToolSnap,
 )
 from suturetrack.camera import StereoRig
+from suturetrack.segmentation import joined
 from suturetrack.types import (
     Grasp,
     Nurbs,
@@ -112,10 +113,11 @@ class Header(msgspec.Struct, frozen=True):
     period_ns: _Count = 0
     """Of raw arrays: time until the next frame is due; 0 where nothing is promised."""
     dtype: _Name = ""
-    shapes: Annotated[list[list[_Side]], msgspec.Meta(max_length=2 + 2 * MOST_THREADS)] = []
+    shapes: Annotated[list[list[_Side]], msgspec.Meta(max_length=2 * MOST_THREADS)] = []
     """Of the arrays in the payload, one after another."""
     threads: Annotated[list[_Name], msgspec.Meta(max_length=MOST_THREADS)] = []
-    """Whose own fields follow, left and right of each, on the field of all."""
+    """Of a field, where several have one of their own: whose left and right follow one another. The
+    field of all has the longest of their vectors at each pixel."""
 
 
 def encoding_of(kind: type[Any]) -> str:
@@ -130,7 +132,7 @@ def encode(message: object, publisher: str = "", number: int = 0, sent_ns: int =
     kind = type(message)
     if isinstance(message, StereoFrame | RidgeField):
         own = message.own if isinstance(message, RidgeField) else {}
-        pairs = (message.left, message.right), *own.values()
+        pairs: list[tuple[Any, Any]] = [*own.values()] or [(message.left, message.right)]
         views = [np.ascontiguousarray(v, _RAW[kind][1]) for v in itertools.chain(*pairs)]
         stamp = (message.stamp.frame, message.stamp.capture_ns, message.stamp.released_ns)
         shapes = [list(v.shape) for v in views]
@@ -175,7 +177,7 @@ def _decode_raw(packet: Packet, kind: type[Any], header: Header) -> Any:
     dtype = _RAW[kind][1]
     if header.dtype != dtype.str:
         raise WireError(f"dtype {header.dtype!r}, expected {dtype.str!r}")
-    if header.stamp is None or len(header.shapes) != 2 + 2 * len(header.threads):
+    if header.stamp is None or len(header.shapes) != 2 * max(len(header.threads), 1):
         raise WireError("the header lacks the stamp or the two shapes")
     sizes = [math.prod(shape) for shape in header.shapes]
     if len(packet.payload) != sum(sizes) * dtype.itemsize:
@@ -184,12 +186,13 @@ def _decode_raw(packet: Packet, kind: type[Any], header: Header) -> Any:
         raise WireError("the header names a thread twice")
     data = np.frombuffer(bytes(packet.payload), dtype)
     parts = np.split(data, np.cumsum(sizes)[:-1])
-    left, right, *rest = (p.reshape(s) for p, s in zip(parts, header.shapes, strict=True))
-    stamp = Stamp(*header.stamp, header.period_ns)
-    if not rest:
-        return kind(stamp, left, right)
-    own = dict(zip(header.threads, zip(rest[::2], rest[1::2], strict=True), strict=True))
-    return kind(stamp, left, right, own)
+    views = [p.reshape(s) for p, s in zip(parts, header.shapes, strict=True)]
+    stamp, pairs = Stamp(*header.stamp, header.period_ns), zip(views[::2], views[1::2], strict=True)
+    if kind is StereoFrame or not header.threads:
+        return kind(stamp, *next(pairs))
+    if any(view.shape != views[0].shape or view.shape[2:] != (2,) for view in views):
+        raise WireError(f"fields of shapes {header.shapes}, expected (H, W, 2) all alike")
+    return joined(stamp, dict(zip(header.threads, pairs, strict=True)))
 
 
 def _decode_small(packet: Packet, kind: type[Any]) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -107,7 +108,7 @@ class Segmenter:
         """As they were when they were seen last."""
         self._first = _Sight(rig, config, _first_look(config))
         self._sights: dict[str, _Sight] = {}
-        self._all: _Pair | None = None
+        self._all: Float32 | None = None
         self._steps = 0
         self._is_cut_out = False
 
@@ -128,7 +129,7 @@ class Segmenter:
         self._steps += 1
         own = {name: sight.step(frame, slot) for name, sight in self._sights.items()}
         if len(own) > 1:
-            return RidgeField(frame.stamp, *self._longest(list(own.values()), slot), own)
+            return joined(frame.stamp, own, self._room_for_all(slot))
         return RidgeField(
             frame.stamp, *(own.popitem()[1] if own else self._first.step(frame, slot))
         )
@@ -244,17 +245,30 @@ class Segmenter:
         else:
             self._sights[thread] = _Sight(self._rig, self._config, look)
 
-    def _longest(self, fields: list[_Pair], slot: int) -> _Pair:
+    def _room_for_all(self, slot: int) -> _Pair:
         width, height = self._rig.image_size
         if self._all is None:
-            left, right = np.empty((2, _SLOTS, height, width, 2), np.float32)
-            self._all = left, right
-        left, right = self._all[0][slot], self._all[1][slot]
-        for out, views in zip((left, right), zip(*fields, strict=True), strict=True):
-            np.copyto(out, views[0])
-            for view in views[1:]:
-                ridge.keep_longer(view, out)
+            self._all = np.empty((_SLOTS, 2, height, width, 2), np.float32)
+        left, right = self._all[slot]
         return left, right
+
+
+def joined(stamp: Stamp, own: Mapping[str, _Pair], out: _Pair | None = None) -> RidgeField:
+    """The field of several threads: at each pixel the longest of their vectors.
+
+    Args:
+        stamp: of the frame.
+        own: by thread, left and right, (H, W, 2) float32 each.
+        out: where to put left and right; without it, new arrays that nobody may write to.
+    """
+    first, *others = own.values()
+    left, right = out or (np.empty_like(first[0]), np.empty_like(first[1]))
+    for side, longest in enumerate((left, right)):
+        np.copyto(longest, first[side])
+        for other in others:
+            ridge.keep_longer(other[side], longest)
+        longest.flags.writeable = out is not None
+    return RidgeField(stamp, left, right, own)
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ from services.run_folder import RunFolder
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Growth, Initialization, InitializationError, ViewGrowth
+from suturetrack.segmentation import joined
 from suturetrack.types import (
     Energies,
     Nurbs,
@@ -84,7 +85,9 @@ def frame() -> StereoFrame:
 def ridges(request: pytest.FixtureRequest) -> RidgeField:
     rng, own = np.random.default_rng(2), request.param
     views = rng.normal(0, 0.3, (1 + len(own), 2, 480, 640, 2)).astype(np.float32)
-    return RidgeField(STAMP, *views[0], dict(zip(own, map(tuple, views[1:]), strict=True)))
+    if own:
+        return joined(STAMP, dict(zip(own, map(tuple, views[1:]), strict=True)))
+    return RidgeField(STAMP, *views[0])
 
 
 def test_full_images_and_fields_come_back_to_the_bit_though_buffers_are_used_again(

@@ -28,6 +28,7 @@ from services.messages import (
 from services.wire import Packet, WireError
 from suturetrack.camera import StereoRig
 from suturetrack.grasping import GraspPoint
+from suturetrack.segmentation import joined
 from suturetrack.types import (
     Energies,
     Grasp,
@@ -72,7 +73,9 @@ def frame(shape: tuple[int, ...] = (48, 64, 3)) -> StereoFrame:
 
 def field(shape: tuple[int, ...] = (48, 64, 2), own: tuple[str, ...] = ()) -> RidgeField:
     views = RNG.uniform(-0.7, 0.7, (1 + len(own), 2, *shape)).astype(np.float32)
-    return RidgeField(STAMP, *views[0], dict(zip(own, map(tuple, views[1:]), strict=True)))
+    if own:
+        return joined(STAMP, dict(zip(own, map(tuple, views[1:]), strict=True)))
+    return RidgeField(STAMP, *views[0])
 
 
 LATENCY = Latency(1.0, 2.0, 3.0)
@@ -237,7 +240,8 @@ def test_headers_that_lie_are_refused(changes: dict[str, Any], reason: str) -> N
         ({"threads": ["0", 7]}, "threads"),
         ({"threads": ["0", "x" * 1000]}, "threads"),
         ({"threads": ["0"] * 1000}, "threads"),
-        ({"shapes": [[48, 64, 2]] * 4 + [[48, 64, 2], [64, 48, 2]]}, "field of thread 1 is"),
+        ({"shapes": [[48, 64, 2]] * 3 + [[64, 48, 2]]}, "all alike"),
+        ({"shapes": [[48, 128]] * 4}, "all alike"),
         ({"shapes": [[48, 64, 2]] * 1000}, "shapes"),
     ],
 )

@@ -66,10 +66,10 @@ def field(field: RidgeField, rig: StereoRig, level: Level) -> Iterator[Entry]:
         picture = unrectified(direction_image(vectors), rig, view)
         yield f"/rig/{view}/image/direction", jpeg(picture)
         if level == "full":
-            every = np.stack([vectors, *(pair[side] for pair in field.own.values())])
-            numbers: dict[str, Any] = {"shape": every.shape, "vectors": every}
+            numbers: dict[str, Any] = {"shape": vectors.shape, "vectors": vectors}
             if field.own:
-                numbers["threads"] = list(field.own)
+                own = np.stack([pair[side] for pair in field.own.values()])
+                numbers |= {"vectors": own, "threads": list(field.own)}
             yield f"/rig/{view}/field", values("RidgeField", numbers)
 
 
