@@ -94,8 +94,8 @@ def test_full_images_and_fields_come_back_to_the_bit_though_buffers_are_used_aga
     tmp_path: Path, rig: StereoRig, frame: StereoFrame, ridges: RidgeField
 ) -> None:
     images = {"left": frame.left.copy(), "right": frame.right.copy()}
-    pairs = [(ridges.left, ridges.right), *ridges.own.values()]
-    fields = np.copy(pairs)
+    pairs = [*ridges.own.values()] or [(ridges.left, ridges.right)]
+    fields = np.array([(ridges.left, ridges.right), *ridges.own.values()])
     with Recorder(tmp_path, "source", "full", rig) as recorder:
         recorder.frame(frame, PUBLISHED)
         recorder.field(ridges, PUBLISHED)
