@@ -21,6 +21,7 @@ from services.service import Service, ServiceConfig, Stopped, compiling
 from services.wire import scaled
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationConfig, InitializationError
+from suturetrack.segmentation import joined
 from suturetrack.tracking import Tracker, TrackerStep, TrackingConfig
 from suturetrack.types import RidgeField, Seed, Stamp
 
@@ -128,4 +129,4 @@ def warm_up(rig: StereoRig, config: TrackerConfig) -> None:
         tracker.step(RidgeField(Stamp(frame, frame * 33_333_333, 0), views[0], views[1]))
     nothing = np.zeros_like(views[0])
     nothing.flags.writeable = False
-    tracker.step(RidgeField(Stamp(3, 100_000_000, 0), nothing, nothing))
+    tracker.step(joined(Stamp(3, 100_000_000, 0), dict.fromkeys("01", (nothing, nothing))))
