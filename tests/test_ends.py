@@ -94,6 +94,16 @@ def test_an_end_beside_another_ridge_only_makes_good_what_is_lacking() -> None:
     assert stop == pytest.approx(8 * PIXEL)
 
 
+@pytest.mark.parametrize(("is_known", "wanted"), [(False, 100 * (1 + 8 * PIXEL)), (True, 100.0)])
+def test_what_goes_on_beyond_an_end_on_a_known_thread_is_not_wanted(
+    is_known: bool, wanted: float
+) -> None:
+    watch, now = settled_watch(100.0)
+    beside = replace(step_at(8.0), alone=False, on_another=is_known)
+    assert watch.moves(step_at(0.0), beside, 100.0, now + FRAME_NS) == (0.0, 0.0)
+    assert watch.wanted == pytest.approx(wanted)
+
+
 def test_an_end_beside_another_ridge_gives_back_what_is_too_much() -> None:
     watch, now = settled_watch(100.0)
     beside = replace(step_at(1.0), alone=False)

@@ -41,6 +41,8 @@ class EndStep:
     """Whether the image's border cuts the thread."""
     alone: bool = True
     """Whether no other ridge runs beside the end, which it could run on along."""
+    on_another: bool = False
+    """Whether another thread is known to lie there: what goes on beyond the end may be that one."""
 
     @property
     def offset(self) -> float:
@@ -216,7 +218,8 @@ class EndWatch:
         self.settled = False
         """Whether the length has been steady for long enough to be the thread's own."""
         self.wanted = length
-        """Length that the thread would have if every step at its ends were believed."""
+        """Length that the thread would have if every step at its ends were believed, but for those along
+        other threads that are known."""
         self.seen = (True, True)
         self.at_border = False
         """Whether the image's border cuts the thread."""
@@ -237,7 +240,8 @@ class EndWatch:
         self._is_known |= is_known
         steps = start, stop
         offsets = [step.offset if step else 0.0 for step in steps]
-        self.wanted = length * (1.0 + sum(offsets))
+        believed = [step.offset for step in steps if step and not step.on_another]
+        self.wanted = length * (1.0 + sum(believed))
         doubted = self._doubted(steps, offsets, length, now_ns)
         seen = [end not in doubted for end in (0, 1)]
         for end in doubted:

@@ -301,8 +301,8 @@ class Follower:
         best = self._search(predicted, field, neighbours.shown_in(field, model.levels))
         model.curve = best.fit.curve
         if best.share > 0.3:
-            hidden = covered(best.fit.views(self.rig), neighbours)
-            self._adjust_ends(field, best.fit.crowded | hidden)
+            known = covered(best.fit.views(self.rig), neighbours)
+            self._adjust_ends(field, best.fit.crowded, known)
         self._cut_doubled_ends()
         model.curve, inserted, removed = rearrange(model.curve, self.rig)
         return best, inserted, removed
@@ -344,10 +344,13 @@ class Follower:
         self._share = best.share
         return best
 
-    def _adjust_ends(self, field: RidgeField, crowded: Bool) -> None:
+    def _adjust_ends(self, field: RidgeField, crowded: Bool, known: Bool) -> None:
+        """Moves the ends; (k,) samples are `crowded` by other ridges, or on threads that are `known`."""
         model = self.model
-        tips = crowded[:_TIP], crowded[-_TIP:]
-        steps = [self._end_step(end, field, alone=not tips[end].any()) for end in (0, 1)]
+        steps = [
+            self._end_step(end, field, bool(crowded[tip].any()), bool(known[tip].any()))
+            for end, tip in enumerate((slice(_TIP), slice(-_TIP, None)))
+        ]
         start, stop = model.ends.moves(
             steps[0],
             steps[1],
@@ -358,10 +361,13 @@ class Follower:
         if start or stop:
             model.curve = _with_ends(model.curve, -start, 1.0 + stop)
 
-    def _end_step(self, end: int, field: RidgeField, *, alone: bool) -> EndStep | None:
+    def _end_step(
+        self, end: int, field: RidgeField, crowded: bool, on_another: bool
+    ) -> EndStep | None:
         model, now_ns = self.model, field.stamp.capture_ns
         step = find_end(model.curve, end, field, self.rig, model.levels)
-        step = step and replace(step, alone=alone)
+        alone = not (crowded or on_another)
+        step = step and replace(step, alone=alone, on_another=on_another)
         other = self._mouths[1 - end]
         return self._mouths[end].steady(step, model.curve, end, other, self.rig, now_ns)
 
