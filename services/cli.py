@@ -78,7 +78,13 @@ VERBS = {
 def main() -> None:
     """The command `suturetrack`."""
     arguments = sys.argv[1:]
-    status = call(arguments)
+    try:
+        status = call(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Who read has seen enough, as `| head` does; the interpreter would complain once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 1
     if arguments and arguments[0] in VERBS and VERBS[arguments[0]].process:
         _leave(status)
     sys.exit(status)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tomllib
@@ -189,3 +190,14 @@ def test_the_overview_loads_no_heavy_library() -> None:
     code = "import sys; from services import cli; cli.call([]); print('numpy' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.endswith("False\n")
+
+
+@pytest.mark.parametrize("arguments", ["--help", "run --help", "scenes"])
+def test_a_reader_that_has_seen_enough_gets_no_complaint(arguments: str) -> None:
+    command = [sys.executable, "-m", "services.cli", *arguments.split()]
+    reading, writing = os.pipe()
+    os.close(reading)
+    out = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE)
+    os.close(writing)
+    assert out.returncode == 1
+    assert out.stderr == b""
