@@ -283,6 +283,21 @@ def test_a_thread_that_is_drawn_out_grows(rig: StereoRig) -> None:
     assert len(states[-1].curve.control_points) > len(states[0].curve.control_points)  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize("points", [14, 22])
+def test_a_thread_that_is_drawn_out_past_a_stray_ridge_grows(rig: StereoRig, points: int) -> None:
+    """A few px beside some of its length another ridge runs, while it rests and then is drawn out."""
+    whole = thread(0.0)
+    beside = whole[200 : 200 + points]
+    normal = np.cross(beside[-1] - beside[0], [0.0, 0.0, -1.0])
+    stray = beside + 1.2 * normal / np.linalg.norm(normal)
+    lengths = np.r_[np.full(40, 400), np.linspace(400, 560, 60).astype(int)]
+    shown = [[whole[:k], stray] if i > 5 else [whole[:k]] for i, k in enumerate(lengths)]
+    fields = [paint(rig, threads, i) for i, threads in enumerate(shown)]
+    states = follow(fields, rig, seed_on(rig, whole[:350]))
+    assert all(state.status is Status.TRACKING for state in states)
+    assert states[-1].length == pytest.approx(metrics.polyline_length(whole[:560]), rel=0.012)
+
+
 def test_an_end_does_not_run_on_along_what_it_meets(rig: StereoRig) -> None:
     truth = thread(0.0)
     along = truth[-1] - truth[-2]

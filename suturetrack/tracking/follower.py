@@ -49,6 +49,8 @@ _NOISE_SIGMAS = 3.0
 # What is shorter or longer by more has nothing to do with the thread.
 _LEAST_LEFT, _MOST_ADDED = 0.65, 1.5
 _ALL = 0.97
+# Share that has to run alone, so that the others, which other ridges draw aside, hardly make it longer.
+_CLEAR = 0.94
 _SURE_AFTER_S = 0.08
 # How long a doubtful end is held before it is cut off.
 _PATIENCE_S = 0.06
@@ -183,12 +185,12 @@ class Follower:
         Where other ridges draw it aside, most of all in depth, they make it longer.
         """
         longest = (1 + _DETOUR) * self.known_length + _noise(evidence)
-        is_clear = (plain & evidence.alone).mean() > _ALL
+        is_clear = (plain & evidence.alone).mean() > _CLEAR
         return self._established and not is_clear and length_of(self.model.curve) > longest
 
     def _has_changed(self, plain: Bool, evidence: Evidence) -> bool:
         """Whether the curve has another length than the thread ever had."""
-        is_clear = (plain & evidence.alone).mean() > _ALL
+        is_clear = (plain & evidence.alone).mean() > _CLEAR
         tolerance = _LENGTH_TOLERANCE if is_clear else _CROWDED_TOLERANCE
         length, noise = length_of(self.model.curve), _noise(evidence)
         lengths = *self.known_lengths, length_of(self.last_good)
@@ -207,7 +209,7 @@ class Follower:
         certain = doubted.mean() <= ASTRAY and not overlong and not self._short
         whole = plain.mean() > _ALL and bool(plain[[0, 1, -2, -1]].all())
         if certain and whole and not (self._lost or self._cut):
-            self._learn_length(seconds, may_grow=(plain & evidence.alone).mean() > _ALL)
+            self._learn_length(seconds, may_grow=(plain & evidence.alone).mean() > _CLEAR)
         if not certain:
             self._doubted_ns = model.capture_ns
         if (model.capture_ns - self._doubted_ns) * _NS > _SURE_AFTER_S:
