@@ -193,11 +193,11 @@ def test_the_overview_loads_no_heavy_library() -> None:
 
 
 @pytest.mark.parametrize("arguments", ["--help", "run --help", "scenes"])
-def test_a_reader_that_has_seen_enough_gets_no_complaint(arguments: str) -> None:
+def test_a_reader_that_has_seen_enough_gets_no_complaint(tmp_path: Path, arguments: str) -> None:
     command = [sys.executable, "-m", "services.cli", *arguments.split()]
     reading, writing = os.pipe()
     os.close(reading)
-    out = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE)
+    out = subprocess.run(command, cwd=tmp_path, stdout=writing, stderr=subprocess.PIPE)
     os.close(writing)
     assert out.returncode == 1
     assert out.stderr == b""
