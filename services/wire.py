@@ -178,17 +178,19 @@ def _decode_raw(packet: Packet, kind: type[Any], header: Header) -> Any:
     if header.dtype != dtype.str:
         raise WireError(f"dtype {header.dtype!r}, expected {dtype.str!r}")
     if header.stamp is None or len(header.shapes) != 2 * max(len(header.threads), 1):
-        raise WireError("the header lacks the stamp or the two shapes")
+        raise WireError("the header lacks the stamp or two shapes, of a field two for each thread")
     sizes = [math.prod(shape) for shape in header.shapes]
     if len(packet.payload) != sum(sizes) * dtype.itemsize:
         raise WireError(f"{len(packet.payload)} bytes for shapes {header.shapes} of {dtype}")
+    if header.threads and kind is not RidgeField:
+        raise WireError("the header names threads, which only fields have")
     if len(set(header.threads)) < len(header.threads):
         raise WireError("the header names a thread twice")
     data = np.frombuffer(bytes(packet.payload), dtype)
     parts = np.split(data, np.cumsum(sizes)[:-1])
     views = [p.reshape(s) for p, s in zip(parts, header.shapes, strict=True)]
     stamp, pairs = Stamp(*header.stamp, header.period_ns), zip(views[::2], views[1::2], strict=True)
-    if kind is StereoFrame or not header.threads:
+    if not header.threads:
         return kind(stamp, *next(pairs))
     if any(view.shape != views[0].shape or view.shape[2:] != (2,) for view in views):
         raise WireError(f"fields of shapes {header.shapes}, expected (H, W, 2) all alike")

@@ -225,6 +225,7 @@ def header_of(packet: Packet, **changes: Any) -> Packet:
         ({"stamp": [0, 2**63, 0]}, "stamp"),
         ({"stamp": [0.5, 0, 0]}, "stamp"),
         ({"publisher": "x" * 1000}, "publisher"),
+        ({"threads": ["0"]}, "only fields"),
     ],
 )
 def test_headers_that_lie_are_refused(changes: dict[str, Any], reason: str) -> None:
