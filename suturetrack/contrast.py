@@ -25,7 +25,9 @@ SIGMAS = (1.2, 2.4, 4.8, 9.6)
 GRAY = np.array([29.0, 150.0, 77.0]) / 256
 """The usual weights of blue, green and red, in 256ths."""
 
-_WINDOW_PX = 64
+# Half the width of the windows in which the thread is followed, so that what varies along it counts,
+# and in which all else is clutter: a thread that crosses near the seed is much of what is near.
+_WINDOW_PX, _NEAR_PX = 128, 64
 _SNAP_PX = 8
 # Fewest pixels of a halved image within which a ridge is looked for.
 _LEAST_SNAP_PX = 2
@@ -134,7 +136,8 @@ def contrast_at(image: Image, pixel: tuple[float, float]) -> Contrast | None:
     scene = _Scene.of(crop, sigma)
     ridge = _Ridge(zoom * best.ridge.pixels + seed, best.ridge.normals)
     across = _of_one_thread(scene, ridge, seed)
-    return _contrast(scene.clutter, across, sigma * 2**octave, channel_means(image))
+    clutter = scene.clutter_near(seed, zoom * _NEAR_PX)
+    return _contrast(clutter, across, sigma * 2**octave, channel_means(image))
 
 
 def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
@@ -219,11 +222,15 @@ class _Scene:
                 for taps in ((curve, smooth), (slope, slope), (smooth, curve))
             ]
         ).reshape(3, *planes.shape)
-        uu, uv, vv = hessian.reshape(3, -1, planes.shape[2])
-        clutter = (uu.T @ uu + 2 * uv.T @ uv + vv.T @ vv) / (2 * len(uu))
-        clutter += _FLOOR * np.eye(len(clutter))
+        clutter = _scatter(hessian)
         shadow = _SHADOW * planes.mean((0, 1))
         return cls(hessian, clutter, clutter + np.outer(shadow, shadow), sigma)
+
+    def clutter_near(self, pixel: Float64, half: int) -> Float64:
+        """(channels, channels): the clutter in a window around a pixel."""
+        u, v = np.rint(pixel).astype(int)
+        near = slice(max(v - half, 0), v + half), slice(max(u - half, 0), u + half)
+        return _scatter(self.hessian[:, *near])
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,6 +250,13 @@ class _Ridge:
         uu, uv, vv = scene.hessian[:, v, u]
         nu, nv = self.normals[:, :1], self.normals[:, 1:]
         return nu * nu * uu + 2 * nu * nv * uv + nv * nv * vv
+
+
+def _scatter(hessian: Float64) -> Float64:
+    """(channels, channels): the covariance of second derivatives, (3, H, W, channels)."""
+    uu, uv, vv = hessian.reshape(3, -1, hessian.shape[-1])
+    scatter = (uu.T @ uu + 2 * uv.T @ uv + vv.T @ vv) / (2 * len(uu))
+    return np.asarray(scatter + _FLOOR * np.eye(len(scatter)))
 
 
 def _window(

@@ -528,6 +528,17 @@ def test_threads_that_cross_near_a_seed_are_seen_together(number: int) -> None:
         assert np.linalg.norm(learned.across - right) < 0.25 * np.linalg.norm(right)
 
 
+def test_what_varies_along_the_thread_counts() -> None:
+    """A black thread on a ground of several colours, seeded where it is blue."""
+    scene = open_scene("clutter", 253)
+    truth = scene.truth(0)[0]
+    field = learned_field(scene, Seed(pixel=scene.seed_pixel()), SegmentationConfig())
+    u, v = np.rint(scene.rig.project(truth.points[truth.visible])[0]).astype(int).T
+    shown = np.linalg.norm(field[v, u], axis=-1)
+    stretches = np.array_split(shown, 20)
+    assert min(np.mean(stretch) for stretch in stretches) > 0.2
+
+
 @pytest.mark.parametrize("light", [(1.6, 1.0, 0.45), (0.55, 0.8, 1.15), (0.4, 0.4, 0.4)])
 def test_another_exposure_and_white_balance_show_the_same(
     scene: Scene, light: tuple[float, float, float]
