@@ -308,6 +308,25 @@ def test_an_end_that_is_seen_to_stop_short_of_the_thread_is_not_doubtful(
     assert (found.confidence < 0.7) == is_doubtful
 
 
+@pytest.mark.parametrize(("apart", "is_doubtful"), [(4.7, False), (3.0, True)])
+def test_an_end_beside_its_own_thread_is_seen_where_the_two_are_apart(
+    rig: StereoRig, apart: float, is_doubtful: bool
+) -> None:
+    """It comes back along its own side."""
+    angle = np.linspace(0, np.pi, 400)
+    turn = np.c_[np.sin(angle), np.cos(angle)]
+    left = np.r_[
+        np.linspace([150.0, 300], [420, 300], 800),
+        [420, 260] + 40 * turn,
+        np.linspace([420.0, 220], [320, 220], 300),
+        [320, 259 - apart / 2] - [1, 39 - apart / 2] * turn[:200] * [40, 1],
+    ]
+    left = np.r_[left, np.linspace([280.0, 300 - apart], [310, 300 - apart], 90)]
+    views = [draw(left, rig), draw(left - [110, 0], rig)]
+    found = initialize(field_of(*views, rig), rig, Seed(pixel=(200.0, 300.0)))
+    assert any("beside another ridge" in why for why in found.reasons) == is_doubtful
+
+
 def test_a_highlight_is_bridged(rig: StereoRig, curve: Nurbs) -> None:
     truth = dense(curve)
     views = []

@@ -36,6 +36,8 @@ _RUNS_ON = 0.55
 """Price of a merge below which an end might as well run on."""
 _GAP, _GAP_SAMPLES = 0.85, 13
 """Least ||V|| between an end and another strand, against both, below which a gap is seen there."""
+_SEPARATE_PX = 4.2
+"""Distance from which an end beside the thread itself is seen to end: nearer ones run into it."""
 _PARALLEL = 0.7
 """Cosine of the angle up to which a strand that ends on the thread runs into it."""
 _CLEAR, _LEAVES_PX = 0.6, 15.0
@@ -139,7 +141,7 @@ def _runs_into_another(merged: Merged, tip: int, entries: list[int], ridges: Rid
     at, distance = _nearest(points, end)
     between = ridges.sample(np.linspace(end, points[at], _GAP_SAMPLES))
     is_joined = between.min() > _GAP * min(between[0], between[-1])
-    return bool(distance < TOUCHING_PX and is_joined)
+    return bool(distance < _SEPARATE_PX and is_joined)
 
 
 def _nearest(points: Float64, place: Float64) -> tuple[int, float]:
