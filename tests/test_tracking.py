@@ -272,6 +272,56 @@ def test_an_end_that_was_given_up_may_come_back(rig: StereoRig) -> None:
     assert states[-1].length > 97.0
 
 
+@pytest.mark.parametrize("left", [200, 350, 480])
+def test_a_thread_that_is_cut_is_taken_for_what_is_left(rig: StereoRig, left: int) -> None:
+    """It is at rest, and most, some, or little of it is gone at once."""
+    whole = thread(0.0)
+    rest, cut = whole[:left], round(0.5 * FPS)
+    fields = [paint(rig, [whole if i < cut else rest], i) for i in range(cut + round(2.7 * FPS))]
+    states = follow(fields, rig, seed_on(rig, whole[:150]))
+    waiting = states[cut + round(0.4 * FPS) : cut + round(1.9 * FPS)]
+    assert {state.status for state in waiting} == {Status.OCCLUDED}
+    assert all(state.length == pytest.approx(100.0, rel=0.02) for state in waiting)
+    for state in states[-10:]:
+        assert state.status is Status.TRACKING
+        assert error(state, rest).rms < 0.2
+        assert max(error(state, rest).ends) < 0.6
+
+
+def test_what_was_hidden_for_long_is_taken_up_at_once(rig: StereoRig) -> None:
+    """Nearly half of the thread, for as long as makes it count as gone."""
+    whole = thread(0.0)
+    hidden = range(round(0.5 * FPS), round(8.0 * FPS))
+    fields = [
+        paint(rig, [whole[:340] if i in hidden else whole], i)
+        for i in range(hidden.stop + round(1.5 * FPS))
+    ]
+    states = follow(fields, rig, seed_on(rig, whole[:150]))
+    assert states[hidden.stop - 1].length == pytest.approx(
+        metrics.polyline_length(whole[:340]), rel=0.01
+    )
+    assert states[hidden.stop - 1].status is Status.TRACKING
+    assert states[-1].status is Status.TRACKING
+    assert error(states[-1], whole).rms < 0.1
+    assert max(error(states[-1], whole).ends) < 0.6
+
+
+def test_a_thread_that_was_cut_while_it_was_lost_is_found_in_the_end(rig: StereoRig) -> None:
+    """It comes back shorter and turned; soon after, a curve of that length may be another thread's."""
+    whole = thread(0.0)
+    turned = (whole - whole.mean(0)) @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + whole.mean(
+        0
+    )
+    gone, back = round(0.5 * FPS), round(1.5 * FPS)
+    shown = [[whole]] * gone + [[]] * (back - gone) + [[turned[:400]]] * round(7.0 * FPS)
+    fields = [paint(rig, threads, i) for i, threads in enumerate(shown)]
+    states = follow(fields, rig, seed_on(rig, whole))
+    waiting = states[gone + round(0.3 * FPS) : back + round(3.0 * FPS)]
+    assert {state.status for state in waiting} == {Status.LOST}
+    assert states[-1].status is Status.TRACKING
+    assert error(states[-1], turned[:400]).rms < 0.2
+
+
 def test_a_thread_that_is_drawn_out_grows(rig: StereoRig) -> None:
     whole = thread(0.0)
     lengths = np.linspace(350, 560, 40).astype(int)

@@ -206,14 +206,20 @@ class EndWatch:
     it runs on along; not for long where the length was not steady for long, for then something has
     come out of hiding. An end beside which another ridge runs makes good what is lacking, and gives back
     what is too much.
+
+    Args:
+        length: of the thread now.
+        now_ns: capture time.
+        before: a length that it had, and may have again: the rest was hidden.
     """
 
-    def __init__(self, length: float, now_ns: int) -> None:
+    def __init__(self, length: float, now_ns: int, before: float = 0.0) -> None:
         self._found_ns = now_ns
         self._last_ns = now_ns
         self._seen_ns = [now_ns, now_ns]
         self._steady_ns = now_ns
         self.length = self._longest = self._steady = length
+        self._before = before
         self._is_known = False
         self.settled = False
         """Whether the length has been steady for long enough to be the thread's own."""
@@ -289,7 +295,7 @@ class EndWatch:
         growth = _LONGER_PX if shown[longer].offset_px > _LEAP_PX else _DRAWN_PX
         if (
             unseen_s[longer] < insists_s
-            and total > max(self.length, self._longest) + growth * pixel
+            and total > max(self.length, self._longest, self._before) + growth * pixel
         ):
             return [longer]
         if total < self.length - _DRAWN_PX * pixel:

@@ -25,6 +25,7 @@ from suturetrack.tracking.reliability import (
     RELIABILITY_SAMPLES,
     Doubt,
     Evidence,
+    HiddenEnds,
     judge,
     loose_ends,
 )
@@ -55,6 +56,8 @@ _SURE_AFTER_S = 0.08
 # How long a doubtful end is held before it is cut off.
 _PATIENCE_S = 0.06
 _SOME = 0.2
+# For how long a hidden end is taken to be where it was, and after how long it is gone.
+_HIDDEN_S, _GONE_S = 0.3, 2.0
 # What has to be seen of the last good curve beyond what is seen of the rest, against the length.
 _MORE = 0.05
 # How long a thread is remembered to have been longer.
@@ -96,6 +99,7 @@ class Follower:
         self._certain_ns = now
         self._doubted_ns = -(1 << 62)
         self._doubt = Doubt()
+        self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
         self._share = 1.0
         self._mouths = Mouth(), Mouth()
@@ -199,14 +203,14 @@ class Follower:
     def _judge(
         self, evidence: Evidence, wrong: Bool, plain: Bool, overlong: bool, seconds: float
     ) -> Status:
-        """The status; a curve that was lost must have its length again to be held."""
-        model = self.model
+        """The status, and what follows from it for the next field."""
+        model, doubt = self.model, self._doubt
+        self._hidden.step(evidence.evenly_hidden & ~doubt.outside, model.capture_ns)
         if plain.mean() >= 1 - ASTRAY and model.ends.settled and self._cut:
             self._cut = False
             self._length_before_cut = max(self.known_lengths)
             self.known_length = min(self.known_length, model.ends.length)
-        doubted = wrong | self._doubt.anywhere
-        certain = doubted.mean() <= ASTRAY and not overlong and not self._short
+        certain = (wrong | doubt.anywhere).mean() <= ASTRAY and not (overlong or self._short)
         whole = plain.mean() > _ALL and bool(plain[[0, 1, -2, -1]].all())
         if certain and whole and not (self._lost or self._cut):
             self._learn_length(seconds, may_grow=(plain & evidence.alone).mean() > _CLEAR)
@@ -214,21 +218,30 @@ class Follower:
             self._doubted_ns = model.capture_ns
         if (model.capture_ns - self._doubted_ns) * _NS > _SURE_AFTER_S:
             self._certain_ns = model.capture_ns
-        unseen_s = (model.capture_ns - model.seen_ns) * _NS
         uncertain_s = (model.capture_ns - self._certain_ns) * _NS
-        status = judge(evidence, unseen_s, uncertain_s)
-        gone = self._doubt.gone.mean() > ASTRAY
-        if status is Status.TRACKING and (gone or self._makes_detour(plain, evidence)):
-            status = Status.OCCLUDED
-        if self._lost and self._has_changed(plain, evidence):
-            status = Status.LOST
+        status = self._status(evidence, plain, uncertain_s)
         self._lost = status is Status.LOST
         if status is Status.TRACKING:
             self.last_good = model.curve
         elif self._lost and (evidence.share < _SOME or self._is_beyond_hope):
             self._start_again()
-        elif uncertain_s > _PATIENCE_S and self.config.method != "paper":
-            self._trim(wrong | self._doubt.hopeless)
+        elif self.config.method != "paper":
+            if uncertain_s > _PATIENCE_S:
+                self._trim(wrong | doubt.hopeless)
+            elif not self._lost and evidence.share >= _SOME:
+                self._give_up_hidden_ends()
+        return status
+
+    def _status(self, evidence: Evidence, plain: Bool, uncertain_s: float) -> Status:
+        """The status; a curve that was lost must have its length again to be held."""
+        model = self.model
+        if self._lost and self._has_changed(plain, evidence):
+            return Status.LOST
+        status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
+        is_vague = self._doubt.gone.mean() > ASTRAY
+        is_vague |= any(self._hidden.for_longer_than(_HIDDEN_S))
+        if status is Status.TRACKING and (is_vague or self._makes_detour(plain, evidence)):
+            return Status.OCCLUDED
         return status
 
     def _learn_length(self, seconds: float, *, may_grow: bool) -> None:
@@ -257,10 +270,23 @@ class Follower:
         """Cuts off what has left the thread at an end, to be found anew."""
         start, stop = loose_ends(wrong)
         if 0 < start + stop < len(wrong) / 2:
-            last = len(wrong) - 1
-            self.model.curve = nurbs.part(self.model.curve, start / last, 1 - stop / last)
+            self._cut_off(start, stop)
             self._cut = self._established
-            self._doubt.cut(start, stop)
+
+    def _give_up_hidden_ends(self) -> None:
+        """What has been hidden at an end for long is no part of the thread until it is seen again."""
+        start, stop = self._hidden.for_longer_than(_GONE_S)
+        if start or stop:
+            self._cut_off(start, stop)
+            self._length_before_cut = max(self.known_lengths)
+            length = self.known_length = length_of(self.model.curve)
+            self.model.ends = EndWatch(length, self.model.capture_ns, self._length_before_cut)
+
+    def _cut_off(self, start: int, stop: int) -> None:
+        """Takes so many samples off the ends."""
+        last = RELIABILITY_SAMPLES - 1
+        self.model.curve = nurbs.part(self.model.curve, start / last, 1 - stop / last)
+        self._doubt.cut(start, stop)
 
     def _start_again(self) -> None:
         """Looks from where the thread was last held, from the next field on."""

@@ -42,17 +42,18 @@ class Evidence:
     fit: Fit
     seen: Bool
     """(k,) at the fit's samples: both images show the thread there."""
+    hidden: Bool
+    """(k,) at the fit's samples: neither image does."""
     share: float
     """Share of the curve's length that is seen."""
 
     @classmethod
     def of(cls, fit: Fit) -> Evidence:
         """Judges each sample of the fit."""
-        left, right = fit.offsets
         with np.errstate(invalid="ignore"):
-            near = np.all(np.abs(fit.residual) < _NEAR_PX, axis=1)
-        seen = left.found & right.found & near
-        return cls(fit, seen, float(np.sum(fit.samples.share * seen)))
+            near = np.abs(fit.residual) < _NEAR_PX
+        seen, hidden = np.all(near, axis=1), ~np.any(near, axis=1)
+        return cls(fit, seen, hidden, float(np.sum(fit.samples.share * seen)))
 
     @cached_property
     def sigma(self) -> Float64:
@@ -64,6 +65,11 @@ class Evidence:
     def evenly_seen(self) -> Bool:
         """(K,) whether seen, at evenly spaced parameters."""
         return self._even(self.seen)
+
+    @cached_property
+    def evenly_hidden(self) -> Bool:
+        """(K,) whether hidden, at evenly spaced parameters."""
+        return self._even(self.hidden)
 
     @cached_property
     def alone(self) -> Bool:
@@ -137,7 +143,8 @@ class Doubt:
 
     def __init__(self) -> None:
         self.px: Float64 = np.zeros(RELIABILITY_SAMPLES)
-        self._outside: Bool = np.zeros(RELIABILITY_SAMPLES, bool)
+        self.outside: Bool = np.zeros(RELIABILITY_SAMPLES, bool)
+        """(k,) what is outside the images."""
 
     @classmethod
     def everywhere(cls) -> Doubt:
@@ -164,30 +171,65 @@ class Doubt:
         if seen.any():
             surprise = np.interp(s, s[seen], surprise[seen])
         drift = _DRIFT * moved + surprise + _DRIFT_AT_REST_PX
-        comes_in = self._outside & ~outside
+        comes_in = self.outside & ~outside
         self.px = np.where(seen | comes_in, 0.0, np.hypot(self.px, drift))
-        self._outside = outside
+        self.outside = outside
 
     def cut(self, start: int, stop: int) -> None:
         """So many samples were cut off at the ends."""
         places = np.linspace(start, len(self.px) - 1 - stop, len(self.px))
         self.px = np.interp(places, np.arange(len(self.px)), self.px)
-        self._outside = self._outside[np.rint(places).astype(int)]
+        self.outside = self.outside[np.rint(places).astype(int)]
 
     @property
     def anywhere(self) -> Bool:
         """(k,) what may be anywhere in the images."""
-        return (self.px > _ANYWHERE_PX) & ~self._outside
+        return (self.px > _ANYWHERE_PX) & ~self.outside
 
     @property
     def hopeless(self) -> Bool:
         """(k,) what is surely elsewhere in the images."""
-        return (self.px > _HOPELESS_PX) & ~self._outside
+        return (self.px > _HOPELESS_PX) & ~self.outside
 
     @property
     def gone(self) -> Bool:
         """(k,) what is surely elsewhere outside the images, where it cannot be looked for."""
-        return (self.px > _HOPELESS_PX) & self._outside
+        return (self.px > _HOPELESS_PX) & self.outside
+
+
+class HiddenEnds:
+    """For how long what is next to the ends has been hidden, within the images.
+
+    A stretch in the middle is held from both sides, one at an end from one side only: where its tip is
+    nobody knows for long, and in the end it is gone, drawn away or cut off.
+    """
+
+    def __init__(self, now_ns: int) -> None:
+        self._now_ns = now_ns
+        self._shown_ns = [now_ns, now_ns]
+        self._counts = 0, 0
+
+    def step(self, hidden: Bool, now_ns: int) -> None:
+        """Evenly spaced samples that are `hidden` now."""
+        self._now_ns, self._counts = now_ns, (_run(hidden), _run(hidden[::-1]))
+        for end, count in enumerate(self._counts):
+            if count <= ASTRAY * len(hidden):
+                self._shown_ns[end] = now_ns
+
+    def for_longer_than(self, seconds: float) -> tuple[int, int]:
+        """How many samples at the start and at the stop have been hidden for so long."""
+        hidden_s = [(self._now_ns - shown_ns) * 1e-9 for shown_ns in self._shown_ns]
+        start, stop = (
+            count if time > seconds else 0
+            for count, time in zip(self._counts, hidden_s, strict=True)
+        )
+        return start, stop
+
+
+def _run(hidden: Bool) -> int:
+    """How many are hidden before the first two that are not."""
+    shown = np.flatnonzero(~hidden[:-1] & ~hidden[1:])
+    return int(shown[0]) if len(shown) else len(hidden)
 
 
 def loose_ends(wrong: Bool) -> tuple[int, int]:

@@ -26,6 +26,9 @@ from suturetrack.types import Energies, Float64, Nurbs, RidgeField, Seed, Stamp,
 _REST = 4
 _QUICK_ATTEMPTS = 6
 _RAREST = 3
+# After so many in vain, some 5 s, it may have been cut or drawn out meanwhile: what is sure to be a thread
+# may have any length.
+_ATTEMPTS = 12
 # A thread that was never sure is no stub of what it was found as, against the longest.
 _STUB = 0.5
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
@@ -167,7 +170,7 @@ class Thread:
         turn = self._failures - 1 if is_beside else None
         if self.follower is not None:
             last, rig = self.follower.last_good, self.follower.rig
-            before = self._who_knows_its_length()
+            before = self._who_knows_its_length() if self._failures <= _ATTEMPTS else ()
             return Again(self._seed, self._setup, last, lengths(before), rig, before, turn)
         assert self._state.curve is not None
         known = (self._state.length,) if self._failures <= _QUICK_ATTEMPTS else ()
@@ -232,7 +235,8 @@ class Thread:
         if outcome.state.curve is None:
             return
         is_sure = outcome.pursuit.found.confidence >= SURE
-        is_worse = self._state.status is not Status.TRACKING and (is_sure or not self.is_held)
+        may_be_unsure = not self.is_held and (known_lengths or self.follower is None)
+        is_worse = self._state.status is not Status.TRACKING and (is_sure or may_be_unsure)
         # What is followed may have shrunk from what was found.
         is_whole = has_length(outcome.state.curve, known_lengths)
         is_whole &= not self._is_stub(outcome.state)
