@@ -322,6 +322,28 @@ def test_a_thread_that_was_cut_while_it_was_lost_is_found_in_the_end(rig: Stereo
     assert error(states[-1], turned[:400]).rms < 0.2
 
 
+@pytest.mark.parametrize("is_sure", [True, False])
+def test_what_is_found_for_sure_has_the_length_that_it_has(rig: StereoRig, is_sure: bool) -> None:
+    """It was drawn out by 4 % since it was lost, and another ridge runs beside a third of it."""
+    whole = thread(0.0)
+    beside = whole[150:320]
+    normal = np.cross(beside[-1] - beside[0], [0.0, 0.0, -1.0])
+    stray = beside + 1.2 * normal / np.linalg.norm(normal)
+
+    def found(points: np.ndarray) -> Follower:
+        field = paint(rig, [points], 0)
+        curve = initialize(field, rig, seed_on(rig, whole[:300])).curve
+        return Follower(curve, field, rig, TrackingConfig())
+
+    before, after = found(whole[:500]), found(whole[:520])
+    for i in range(FPS):
+        before.step(paint(rig, [whole[:500]], i), "0")
+    after.remember(before, is_sure=is_sure)
+    states = [after.step(paint(rig, [whole[:520], stray], i), "0") for i in range(FPS)]
+    assert (states[-1].status is Status.TRACKING) == is_sure
+    assert states[-1].length == pytest.approx(metrics.polyline_length(whole[:520]), rel=0.01)
+
+
 def test_a_thread_that_is_drawn_out_grows(rig: StereoRig) -> None:
     whole = thread(0.0)
     lengths = np.linspace(350, 560, 40).astype(int)

@@ -105,10 +105,16 @@ class Follower:
         self._mouths = Mouth(), Mouth()
         self.model = Model(curve, Motion.none(), levels, now, now, EndWatch(length_of(curve), now))
 
-    def remember(self, before: Follower) -> None:
-        """Takes over what was known of the thread's length before it was found anew."""
-        self.known_length, self._established = before.known_length, before._established
-        self._length_before_cut = before._length_before_cut
+    def remember(self, before: Follower, *, is_sure: bool) -> None:
+        """Takes over what was known of the thread's length before it was found anew.
+
+        What is found for sure has the length that it has: the thread may have been drawn out since.
+        """
+        self._established = before._established
+        self._length_before_cut = max(before.known_lengths)
+        if not is_sure:
+            self.known_length = before.known_length
+            self._length_before_cut = before._length_before_cut
 
     def came_from(self, before: Nurbs, seconds: float) -> None:
         """Tells where the thread was found so many seconds ago."""

@@ -40,7 +40,7 @@ class Pursuit:
         self.found = found
         """What is followed, as it was found."""
         if before is not None:
-            self.follower.remember(before)
+            self.follower.remember(before, is_sure=found.confidence >= SURE)
         self._found_at = (field.stamp.capture_ns, found.curve) if is_fresh else None
 
     def step(self, field: RidgeField, others: Neighbours) -> ThreadState:
@@ -72,7 +72,7 @@ class Pursuit:
         if state.status is Status.OCCLUDED and found.confidence < SURE:
             return None
         follower = self._setup.follower(found, field)
-        follower.remember(old)
+        follower.remember(old, is_sure=found.confidence >= SURE)
         again = follower.step(field, self._seed.thread, others)
         if again.status is not Status.TRACKING:
             return None
