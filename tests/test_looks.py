@@ -12,13 +12,19 @@ import pytest
 
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import Initialization, InitializationError, initialize
+from suturetrack.initialization import (
+    Initialization,
+    InitializationConfig,
+    InitializationError,
+    initialize,
+)
 from suturetrack.initialization.matching import raised
-from suturetrack.tracking import Tracker
+from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.tracking.follower import Follower
-from suturetrack.tracking.recovery import directed, doubting_ends
+from suturetrack.tracking.recovery import Setup, directed, doubting_ends
 from suturetrack.tracking.sampling import views
-from suturetrack.tracking.strands import Neighbours, Strand
+from suturetrack.tracking.searches import FromSeed
+from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
 from suturetrack.tracking.sureness import Sureness
 from suturetrack.types import RidgeField, Seed, Status, ThreadState
 from tests.painting import FPS, paint, thread
@@ -540,13 +546,16 @@ def test_what_was_taken_for_the_thread_since_does_not_tell_its_length_alone(
 def test_an_end_that_runs_along_another_thread_leaves_a_look_in_doubt(rig: StereoRig) -> None:
     x = np.linspace(-25, 25, 600)
     points = np.c_[x, 0.01 * x**2, np.full(600, 200.0)]
-    found = initialize(paint(rig, [points], 0), rig, seed_on(rig, points))
-    found = replace(found, confidence=0.9, doubts=((), ()))
+    field, seed = paint(rig, [points], 0), seed_on(rig, points)
+    found = replace(initialize(field, rig, seed), confidence=0.9, doubts=((), ()))
 
-    def beside(other: np.ndarray) -> Initialization:
+    def strands(other: np.ndarray) -> Neighbours:
         both = views(rig, other, np.gradient(other, axis=0))
         left, right = (Strand.other(view, np.ones(len(other), bool)) for view in both)
-        return doubting_ends(found, Neighbours(((left, right),)), rig)
+        return Neighbours(((left, right),))
+
+    def beside(other: np.ndarray) -> Initialization:
+        return doubting_ends(found, strands(other), rig)
 
     along = points[450:] + np.array([0.0, 0.6, 0.0])
     across = np.c_[np.full(600, 24.0), x + 6.0, np.full(600, 200.0)]
@@ -562,3 +571,8 @@ def test_an_end_that_runs_along_another_thread_leaves_a_look_in_doubt(rig: Stere
         assert rest == 0.3
         end = nurbs.evaluate(doubted.curve, np.array([place]))[0]
         assert np.linalg.norm(end - points[450]) < 1.5
+    first = FromSeed(seed, Setup(rig, TrackingConfig(), InitializationConfig()), None)
+    alone, doubted = (first.find(field, others) for others in (NOBODY, strands(along)))
+    assert isinstance(alone, Initialization)
+    assert isinstance(doubted, Initialization)
+    assert doubted.confidence == pytest.approx(0.3 * alone.confidence)

@@ -34,15 +34,15 @@ class FromSeed:
     toward: Nurbs | None
     """A curve that tells its direction."""
 
-    def find(self, field: RidgeField, _: Neighbours) -> Found:
+    def find(self, field: RidgeField, others: Neighbours) -> Found:
         """The thread through the seed, or why there is none."""
         try:
             found = self.setup.look(field, self.seed)
         except InitializationError as error:
             return error
-        if self.toward is None:
-            return found
-        return directed(found, self.toward)
+        rig = self.setup.rig.with_row_offset(found.row_offset_px)
+        found = doubting_ends(found, others, rig)
+        return found if self.toward is None else directed(found, self.toward)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows the first curve."""
