@@ -11,6 +11,7 @@ from scipy.stats import spearmanr
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
+from suturetrack.initialization.segments import split_at_touches
 from suturetrack.metrics import curve_error, polyline_distances
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import Picture, Scene, open_scene
@@ -202,6 +203,23 @@ def loop_with_a_shared_run() -> Float64:
     before, after = around[1] - around[0], around[-1] - around[-2]
     lead = np.linspace(1500, 1, 800)[:, None]
     return np.r_[around[0] - lead * before, around, around[-1] + lead[::-1] * after]
+
+
+@pytest.mark.parametrize("crosses", [True, False])
+def test_crest_lines_that_touch_where_both_turn_are_cut_there(crosses: bool) -> None:
+    """A crossing may look like two bends back to back; what passes a bend straight is no crossing."""
+
+    def bend(within: float, side: float) -> Float64:
+        """Turns by a right angle within so many px; it touches the other one from a side."""
+        heading = np.pi / 4 * np.tanh(np.arange(-60, 61) / within)
+        line = np.cumsum(np.c_[np.sin(heading), np.cos(heading)], axis=0)
+        return (line - line[60]) * [side, 1] + [1.5 * side, 0]
+
+    other = bend(4.5, -1) if crosses else np.c_[np.full(121, -1.5), np.arange(-60.0, 61.0)]
+    pieces = split_at_touches((bend(1.0, 1), other))
+    assert len(pieces) == (4 if crosses else 3)
+    for piece in pieces[2:]:
+        assert (len(piece) < len(other)) == crosses
 
 
 def test_strands_that_lie_on_each_other_are_both_followed(rig: StereoRig) -> None:

@@ -30,6 +30,8 @@ _HEADING = 6
 _KINK_REACH = 5
 _KINK = 0.6
 """Cosine of the turn, over `_KINK_REACH` points to both sides, from which a segment has a kink."""
+_TURN_REACH = 8
+"""Points to both sides over which a segment turns as much that touches another one's kink."""
 _WIDTH_REACH = 40
 """Points of a segment, on each side of the seed, whose width counts."""
 _STEP_ACROSS = 0.5
@@ -117,7 +119,7 @@ def _half_width(profile: Float64) -> float:
 def split_at_touches(segments: tuple[Float64, ...]) -> tuple[Float64, ...]:
     """Cuts segments at junctions that the crest lines do not show as such: where the end of another
     runs into their side at a small angle, so that what two strands share becomes a segment of its
-    own, and where they turn from one strand into another."""
+    own, and where they turn from one strand into another, as both do that touch there."""
     if not segments:
         return ()
     near = _Neighbourhood(segments)
@@ -128,8 +130,12 @@ def split_at_touches(segments: tuple[Float64, ...]) -> tuple[Float64, ...]:
             if hit is not None:
                 cuts.setdefault(hit[0], set()).add(hit[1])
         for i in _kinks(segment):
-            if len(near.others(k, i, segment[i])):
+            others = near.others(k, i, segment[i])
+            if len(others):
                 cuts.setdefault(k, set()).add(i)
+                owner, j = near.nearest(others, segment[i])
+                if _turns(segments[owner], j):
+                    cuts.setdefault(owner, set()).add(j)
     return tuple(
         piece
         for k, s in enumerate(segments)
@@ -154,6 +160,11 @@ class _Neighbourhood:
         apart = (self._owner[near] != k) | (abs(self._index[near] - at) > 2 * ARM)
         return near[apart]
 
+    def nearest(self, near: Int64, place: Float64) -> tuple[int, int]:
+        """The segment, and where on it, of that of some points that is nearest to a place."""
+        hit = near[np.argmin(np.linalg.norm(self._points[near] - place, axis=1))]
+        return int(self._owner[hit]), int(self._index[hit])
+
     def side_hit(self, k: int, at: int, arm: Float64) -> tuple[int, int] | None:
         """The segment, and where on it, that the end of segment `k` runs into along its side."""
         heading = arm[0] - arm[-1]
@@ -161,8 +172,7 @@ class _Neighbourhood:
         near = self.others(k, at, arm[0] + 2 * heading)
         if len(near) == 0:
             return None
-        hit = near[np.argmin(np.linalg.norm(self._points[near] - arm[0], axis=1))]
-        owner, i = int(self._owner[hit]), int(self._index[hit])
+        owner, i = self.nearest(near, arm[0])
         other = self._segments[owner]
         if min(i, len(other) - 1 - i) < _NEAR_PX:
             return None
@@ -182,6 +192,15 @@ def _kinks(segment: Float64) -> list[int]:
         (cosine < _KINK) & (cosine <= minimum_filter1d(cosine, 2 * _KINK_REACH + 1))
     )
     return (kinks + _KINK_REACH).tolist()
+
+
+def _turns(segment: Float64, i: int) -> bool:
+    """Whether a segment turns at its point `i` as much as a kink does."""
+    if not _TURN_REACH <= i < len(segment) - _TURN_REACH:
+        return False
+    before = segment[i] - segment[i - _TURN_REACH]
+    after = segment[i + _TURN_REACH] - segment[i]
+    return bool(before @ after < _KINK * np.linalg.norm(before) * np.linalg.norm(after))
 
 
 def _apart(cuts: list[int]) -> list[int]:
