@@ -572,7 +572,11 @@ def test_an_end_that_runs_along_another_thread_leaves_a_look_in_doubt(rig: Stere
         end = nurbs.evaluate(doubted.curve, np.array([place]))[0]
         assert np.linalg.norm(end - points[450]) < 1.5
     first = FromSeed(seed, Setup(rig, TrackingConfig(), InitializationConfig()), None)
-    alone, doubted = (first.find(field, others) for others in (NOBODY, strands(along)))
+    alone, doubted, same = (
+        first.find(field, others) for others in (NOBODY, strands(along), strands(points))
+    )
     assert isinstance(alone, Initialization)
     assert isinstance(doubted, Initialization)
+    assert isinstance(same, Initialization)
     assert doubted.confidence == pytest.approx(0.3 * alone.confidence)
+    assert same.confidence == alone.confidence

@@ -35,13 +35,14 @@ class FromSeed:
     """A curve that tells its direction."""
 
     def find(self, field: RidgeField, others: Neighbours) -> Found:
-        """The thread through the seed, or why there is none."""
+        """The thread through the seed, which may be one of the others, or why there is none."""
         try:
             found = self.setup.look(field, self.seed)
         except InitializationError as error:
             return error
         rig = self.setup.rig.with_row_offset(found.row_offset_px)
-        found = doubting_ends(found, others, rig)
+        if not lies_on(found.curve, others, rig):
+            found = doubting_ends(found, others, rig)
         return found if self.toward is None else directed(found, self.toward)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
