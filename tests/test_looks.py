@@ -398,6 +398,25 @@ def test_what_was_never_sure_does_not_tell_the_length_but_is_no_stub(
         assert not any("found again" in state.events for state in states)
 
 
+def test_what_was_never_sure_is_followed_again_in_doubt(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truths, away = [thread(i / FPS) for i in range(FPS)], range(3, 14)
+    for points in truths[away.stop :]:
+        points[:, 1] += 15.0
+
+    def look(field: RidgeField, rig: StereoRig, *_: object) -> Initialization:
+        found = initialize(field, rig, seed_on(rig, truths[field.stamp.frame]))
+        return replace(found, confidence=0.1)
+
+    looks_by(monkeypatch, look)
+    states = follow(rig, truths, away)
+    assert states[away[-1]].status is Status.LOST
+    assert any("found again" in state.events for state in states)
+    assert states[-1].status is Status.OCCLUDED
+    assert rms(states[-1], truths[-1]) < 0.15
+
+
 def test_a_curve_that_lacks_an_end_is_what_a_look_finds(rig: StereoRig) -> None:
     field = paint(rig, [thread(0.0)], 0)
     look = initialize(field, rig, seed_on(rig, thread(0.0)))

@@ -288,6 +288,18 @@ def test_a_thread_that_is_cut_is_taken_for_what_is_left(rig: StereoRig, left: in
         assert max(error(state, rest).ends) < 0.6
 
 
+def test_of_a_thread_that_was_cut_no_more_is_given_up_at_once(rig: StereoRig) -> None:
+    """As soon as one end is given up, what is next to it is hidden for a moment."""
+    whole, cut = thread(0.0), round(0.5 * FPS)
+    fields = [paint(rig, [whole if i < cut else whole[:480]], i) for i in range(cut + 75)]
+    seed = seed_on(rig, whole[:150])
+    given_up = next(i for i, s in enumerate(follow(fields, rig, seed)) if s.length < 85.0)
+    hidden = range(given_up + 1, given_up + 6)
+    fields[hidden.start : hidden.stop] = [paint(rig, [whole[:380]], i) for i in hidden]
+    states = follow(fields, rig, seed)
+    assert all(state.length > 75.0 for state in states[: hidden.stop])
+
+
 def test_what_was_hidden_for_long_is_taken_up_at_once(rig: StereoRig) -> None:
     """Nearly half of the thread, for as long as makes it count as gone."""
     whole = thread(0.0)

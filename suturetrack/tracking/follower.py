@@ -282,8 +282,9 @@ class Follower:
     def _give_up_hidden_ends(self) -> None:
         """What has been hidden at an end for long is no part of the thread until it is seen again."""
         start, stop = self._hidden.for_longer_than(_GONE_S)
-        if start or stop:
+        if 0 < start + stop < (1 - _SOME) * RELIABILITY_SAMPLES:
             self._cut_off(start, stop)
+            self._hidden = HiddenEnds(self.model.capture_ns)
             self._length_before_cut = max(self.known_lengths)
             length = self.known_length = length_of(self.model.curve)
             self.model.ends = EndWatch(length, self.model.capture_ns, self._length_before_cut)

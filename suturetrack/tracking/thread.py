@@ -235,7 +235,9 @@ class Thread:
         if outcome.state.curve is None:
             return
         is_sure = outcome.pursuit.found.confidence >= SURE
-        may_be_unsure = not self.is_held and (known_lengths or self.follower is None)
+        # Where any length was looked for, nothing else tells that it is the thread.
+        has_no_length = self.follower is not None and self._was_sure and not known_lengths
+        may_be_unsure = not (self.is_held or has_no_length)
         is_worse = self._state.status is not Status.TRACKING and (is_sure or may_be_unsure)
         # What is followed may have shrunk from what was found.
         is_whole = has_length(outcome.state.curve, known_lengths)
