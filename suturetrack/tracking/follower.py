@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from suturetrack.tracking.crowding import covered
 from suturetrack.tracking.ends import EndStep, EndWatch, find_end
 from suturetrack.tracking.energies import energies
 from suturetrack.tracking.folds import doubled_ends
+from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.motion import Motion
 from suturetrack.tracking.mouth import Mouth
 from suturetrack.tracking.reliability import (
@@ -40,15 +40,7 @@ _WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
 _ENOUGH, _GAIN = 0.97, 0.02
 _DROP = 0.01
 _RETRY = 5
-# A thread found again has the length that it had, to this part; to the other one if it is not alone.
-_LENGTH_TOLERANCE, _CROWDED_TOLERANCE = 0.05, 0.01
-# A thread of which something is hidden has not grown by more.
-_GROWTH = 0.02
-# A thread that is not alone is not longer by more.
-_DETOUR = 0.005
 _NOISE_SIGMAS = 3.0
-# What is shorter or longer by more has nothing to do with the thread.
-_LEAST_LEFT, _MOST_ADDED = 0.65, 1.5
 _ALL = 0.97
 # Share that has to run alone, so that the others, which other ridges draw aside, hardly make it longer.
 _CLEAR = 0.94
@@ -60,8 +52,6 @@ _SOME = 0.2
 _HIDDEN_S, _GONE_S = 0.3, 2.0
 # What has to be seen of the last good curve beyond what is seen of the rest, against the length.
 _MORE = 0.05
-# How long a thread is remembered to have been longer.
-_FORGOTTEN_S = 3.0
 # Places on a thread that keep other threads away.
 _CLAIMS = 160
 # Samples at an end that tell whether another ridge runs beside it.
@@ -92,10 +82,8 @@ class Follower:
         levels = measure_levels(curve, field, rig)
         self.last_good = curve
         """The curve when it was last tracked."""
-        self.known_length = length_of(curve)
-        """Length of the thread when it was last tracked and all of it seen, calibration's unit."""
-        self._length_before_cut = 0.0
-        self._lost = self._cut = self._established = False
+        self.known_length = KnownLength(length_of(curve))
+        self._lost = False
         self._certain_ns = now
         self._doubted_ns = -(1 << 62)
         self._doubt = Doubt()
@@ -106,15 +94,8 @@ class Follower:
         self.model = Model(curve, Motion.none(), levels, now, now, EndWatch(length_of(curve), now))
 
     def remember(self, before: Follower, *, is_sure: bool) -> None:
-        """Takes over what was known of the thread's length before it was found anew.
-
-        What is found for sure has the length that it has: the thread may have been drawn out since.
-        """
-        self._established = before._established
-        self._length_before_cut = max(before.known_lengths)
-        if not is_sure:
-            self.known_length = before.known_length
-            self._length_before_cut = before._length_before_cut
+        """Takes over what was known of the thread's length before it was found anew."""
+        self.known_length = self.known_length.inherited(before.known_length, is_sure=is_sure)
 
     def came_from(self, before: Nurbs, seconds: float) -> None:
         """Tells where the thread was found so many seconds ago."""
@@ -122,11 +103,6 @@ class Follower:
         model.motion = Motion.none().learn(
             before, model.curve, self._seen, model.ends.seen, self.rig, seconds
         )
-
-    @property
-    def known_lengths(self) -> tuple[float, ...]:
-        """Lengths that the thread may have: an end that stays away may have been hidden."""
-        return self.known_length, max(self.known_length, self._length_before_cut)
 
     @property
     def is_doubtful(self) -> bool:
@@ -146,7 +122,7 @@ class Follower:
         """The thread in the next field; `neighbours` are other threads."""
         model = self.model
         seconds = (field.stamp.capture_ns - model.capture_ns) * _NS
-        if self._lost or self._short:
+        if self._lost or self.known_length.is_short(length_of(model.curve)):
             self._take_up_whole(field, seconds)
             model = self.model
         before, predicted = model.curve, model.motion.predict(model.curve, seconds)
@@ -171,65 +147,21 @@ class Follower:
         if inserted or removed:
             events.append(f"control points: {inserted} inserted, {removed} removed")
         astray, plain = evidence.astray(field, self.rig, model.levels, neighbours)
-        overlong = self._overlong(plain, evidence)
-        wrong = astray | (~plain & overlong)
-        status = self._judge(evidence, wrong, plain, overlong, seconds)
+        status = self._judge(evidence, astray, plain, seconds)
         return self._state(field, thread, evidence, status, events)
 
-    def _overlong(self, plain: Bool, evidence: Evidence) -> bool:
-        """Whether the thread seems to have grown, by more than noise in depth makes of its length.
-
-        Where all of it is plain to see and an end seems to go on, the end has met something else;
-        where it is not, the curve makes a detour.
-        """
-        ends = self.model.ends
-        length = length_of(self.model.curve) if plain.mean() > _ALL else ends.wanted
-        # What the border cuts off comes in again.
-        self._established = (self._established or ends.settled) and not ends.at_border
-        longest = (1 + _GROWTH) * max(self.known_lengths) + _noise(evidence)
-        return self._established and length > longest
-
-    def _makes_detour(self, plain: Bool, evidence: Evidence) -> bool:
-        """Whether the curve is longer than the thread and not alone all along.
-
-        Where other ridges draw it aside, most of all in depth, they make it longer.
-        """
-        longest = (1 + _DETOUR) * self.known_length + _noise(evidence)
-        is_clear = (plain & evidence.alone).mean() > _CLEAR
-        return self._established and not is_clear and length_of(self.model.curve) > longest
-
-    def _has_changed(self, plain: Bool, evidence: Evidence) -> bool:
-        """Whether the curve has another length than the thread ever had."""
-        is_clear = (plain & evidence.alone).mean() > _CLEAR
-        tolerance = _LENGTH_TOLERANCE if is_clear else _CROWDED_TOLERANCE
-        length, noise = length_of(self.model.curve), _noise(evidence)
-        lengths = *self.known_lengths, length_of(self.last_good)
-        return all(abs(length - known) > tolerance * known + noise for known in lengths)
-
-    def _judge(
-        self, evidence: Evidence, wrong: Bool, plain: Bool, overlong: bool, seconds: float
-    ) -> Status:
+    def _judge(self, evidence: Evidence, astray: Bool, plain: Bool, seconds: float) -> Status:
         """The status, and what follows from it for the next field."""
         model, doubt = self.model, self._doubt
         self._hidden.step(evidence.evenly_hidden & ~doubt.outside, model.capture_ns)
-        if plain.mean() >= 1 - ASTRAY and model.ends.settled and self._cut:
-            self._cut = False
-            self._length_before_cut = max(self.known_lengths)
-            self.known_length = min(self.known_length, model.ends.length)
-        certain = (wrong | doubt.anywhere).mean() <= ASTRAY and not (overlong or self._short)
-        whole = plain.mean() > _ALL and bool(plain[[0, 1, -2, -1]].all())
-        if certain and whole and not (self._lost or self._cut):
-            self._learn_length(seconds, may_grow=(plain & evidence.alone).mean() > _CLEAR)
-        if not certain:
-            self._doubted_ns = model.capture_ns
-        if (model.capture_ns - self._doubted_ns) * _NS > _SURE_AFTER_S:
-            self._certain_ns = model.capture_ns
-        uncertain_s = (model.capture_ns - self._certain_ns) * _NS
+        wrong, uncertain_s = self._wrong(evidence, astray, plain, seconds)
         status = self._status(evidence, plain, uncertain_s)
         self._lost = status is Status.LOST
         if status is Status.TRACKING:
             self.last_good = model.curve
-        elif self._lost and (evidence.share < _SOME or self._is_beyond_hope):
+        elif self._lost and (
+            evidence.share < _SOME or self.known_length.is_beyond_hope(length_of(model.curve))
+        ):
             self._start_again()
         elif self.config.method != "paper":
             if uncertain_s > _PATIENCE_S:
@@ -238,46 +170,52 @@ class Follower:
                 self._give_up_hidden_ends()
         return status
 
+    def _wrong(
+        self, evidence: Evidence, astray: Bool, plain: Bool, seconds: float
+    ) -> tuple[Bool, float]:
+        """(K,) what of the curve is wrong, and for how long that, or its length, has been too much."""
+        model, ends, length = self.model, self.model.ends, length_of(self.model.curve)
+        known = self.known_length.watched(ends).found(length, ends)
+        is_whole = plain.mean() > _ALL
+        # Where all of it is plain to see and an end seems to go on, the end has met something else;
+        # where it is not, the curve makes a detour.
+        overlong = known.is_outgrown(length if is_whole else ends.wanted, _noise(evidence))
+        if plain.mean() >= 1 - ASTRAY and ends.settled and known.is_cut:
+            known = known.given_up(min(known.now, ends.length))
+        wrong = astray | (~plain & overlong)
+        is_certain = (wrong | self._doubt.anywhere).mean() <= ASTRAY
+        is_certain &= not (overlong or known.is_short(length))
+        has_ends = bool(plain[[0, 1, -2, -1]].all())
+        if is_certain and is_whole and has_ends and not (self._lost or known.is_cut):
+            known = known.learned(ends, seconds, may_grow=_is_clear(plain, evidence))
+        self.known_length = known
+        if not is_certain:
+            self._doubted_ns = model.capture_ns
+        if (model.capture_ns - self._doubted_ns) * _NS > _SURE_AFTER_S:
+            self._certain_ns = model.capture_ns
+        return wrong, (model.capture_ns - self._certain_ns) * _NS
+
     def _status(self, evidence: Evidence, plain: Bool, uncertain_s: float) -> Status:
         """The status; a curve that was lost must have its length again to be held."""
-        model = self.model
-        if self._lost and self._has_changed(plain, evidence):
+        model, known, noise = self.model, self.known_length, _noise(evidence)
+        length, is_clear = length_of(model.curve), _is_clear(plain, evidence)
+        last = length_of(self.last_good)
+        if self._lost and known.is_another(length, last, noise, is_clear=is_clear):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
         is_vague = self._doubt.gone.mean() > ASTRAY
         is_vague |= any(self._hidden.for_longer_than(_HIDDEN_S))
-        if status is Status.TRACKING and (is_vague or self._makes_detour(plain, evidence)):
+        makes_detour = not is_clear and known.is_exceeded(length, noise)
+        if status is Status.TRACKING and (is_vague or makes_detour):
             return Status.OCCLUDED
         return status
-
-    def _learn_length(self, seconds: float, *, may_grow: bool) -> None:
-        """An end that is lost for a moment makes the thread no shorter."""
-        ends = self.model.ends
-        length = ends.length if may_grow else min(ends.length, self.known_length)
-        longest = max(self.known_length, length)
-        fading = 0.0 if ends.settled else math.exp(-max(seconds, 0.0) / _FORGOTTEN_S)
-        self.known_length = length + (longest - length) * fading
-
-    @property
-    def _short(self) -> bool:
-        """Whether a part that was cut off has not been found again."""
-        length = length_of(self.model.curve)
-        self._cut &= length < (1 - _GROWTH) * self.known_length
-        self._cut &= not self.model.ends.at_border
-        return self._cut and length < (1 - _LENGTH_TOLERANCE) * self.known_length
-
-    @property
-    def _is_beyond_hope(self) -> bool:
-        """Whether little of the thread's length is left, or far too much was added."""
-        length, longest = length_of(self.model.curve), max(self.known_lengths)
-        return length < _LEAST_LEFT * self.known_length or length > _MOST_ADDED * longest
 
     def _trim(self, wrong: Bool) -> None:
         """Cuts off what has left the thread at an end, to be found anew."""
         start, stop = loose_ends(wrong)
         if 0 < start + stop < len(wrong) / 2:
             self._cut_off(start, stop)
-            self._cut = self._established
+            self.known_length = self.known_length.cut()
 
     def _give_up_hidden_ends(self) -> None:
         """What has been hidden at an end for long is no part of the thread until it is seen again."""
@@ -285,9 +223,8 @@ class Follower:
         if 0 < start + stop < (1 - _SOME) * RELIABILITY_SAMPLES:
             self._cut_off(start, stop)
             self._hidden = HiddenEnds(self.model.capture_ns)
-            self._length_before_cut = max(self.known_lengths)
-            length = self.known_length = length_of(self.model.curve)
-            self.model.ends = EndWatch(length, self.model.capture_ns, self._length_before_cut)
+            known = self.known_length = self.known_length.given_up(length_of(self.model.curve))
+            self.model.ends = EndWatch(known.now, self.model.capture_ns, known.before_cut)
 
     def _cut_off(self, start: int, stop: int) -> None:
         """Takes so many samples off the ends."""
@@ -298,7 +235,7 @@ class Follower:
     def _start_again(self) -> None:
         """Looks from where the thread was last held, from the next field on."""
         model = self.model
-        ends = EndWatch(self.known_length, model.capture_ns)
+        ends = EndWatch(self.known_length.now, model.capture_ns)
         self.model = replace(model, curve=self.last_good, motion=Motion.none(), ends=ends)
 
     def _take_up_whole(self, field: RidgeField, seconds: float) -> None:
@@ -311,7 +248,7 @@ class Follower:
             length_of(curve) * shown(curve, field, self.rig, model.levels)
             for curve in (whole, rest)
         )
-        if of_whole > of_rest + _MORE * self.known_length:
+        if of_whole > of_rest + _MORE * self.known_length.now:
             self.last_good = whole
             self._start_again()
             self._doubt = Doubt.everywhere()
@@ -391,7 +328,7 @@ class Follower:
             steps[1],
             length_of(model.curve),
             field.stamp.capture_ns,
-            is_known=self._established,
+            is_known=self.known_length.is_established,
         )
         if start or stop:
             model.curve = _with_ends(model.curve, -start, 1.0 + stop)
@@ -434,6 +371,11 @@ class Follower:
 def _noise(evidence: Evidence) -> float:
     """What noise in depth makes of a length."""
     return _NOISE_SIGMAS * float(np.median(evidence.sigma))
+
+
+def _is_clear(plain: Bool, evidence: Evidence) -> bool:
+    """Whether nearly all of the thread is plain to see, with no other ridge beside it."""
+    return bool((plain & evidence.alone).mean() > _CLEAR)
 
 
 def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[float, float]:

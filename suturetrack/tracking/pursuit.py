@@ -66,7 +66,7 @@ class Pursuit:
         assert self._found_at is not None
         old = self.follower
         starts = starts_on(old.last_good, self._seed, field, old.rig)
-        found = find_again(old.last_good, old.known_lengths, starts, field, self._setup)
+        found = find_again(old.last_good, old.known_length.possible, starts, field, self._setup)
         if found is None or lies_on(found.curve, others, old.rig):
             return None
         if state.status is Status.OCCLUDED and found.confidence < SURE:

@@ -119,9 +119,9 @@ Search = FromSeed | Again | Closer
 
 def lengths(followers: tuple[Follower, ...]) -> tuple[float, ...]:
     """What the length of the thread may be, by those who know it."""
-    return tuple(known for follower in followers for known in follower.known_lengths)
+    return tuple(known for follower in followers for known in follower.known_length.possible)
 
 
 def _who_knew(curve: Nurbs, before: tuple[Follower, ...]) -> Follower | None:
     """Who knew a length that is nearest to that of the curve; None where nobody knew any."""
-    return min(before, key=lambda f: length_error(curve, f.known_lengths), default=None)
+    return min(before, key=lambda f: length_error(curve, f.known_length.possible), default=None)
