@@ -226,6 +226,24 @@ def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:
         assert abs(found.length_percent) < 1.0
 
 
+def test_what_hides_much_of_the_middle_does_not_lose_a_thread_that_is_shaken(
+    rig: StereoRig,
+) -> None:
+    """What is held on both sides cannot be far."""
+    truths = [
+        thread(i / FPS) + 0.5 * np.array([np.sin(1.1 * i), np.cos(1.7 * i), 0.0]) for i in range(60)
+    ]
+    fields = []
+    for i, points in enumerate(truths):
+        u, v = rig.project(points[300])[0]
+        fields.append(paint(rig, [points], i, [(u, v, 30.0)] if i >= 8 else []))
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    for state, truth in list(zip(states, truths, strict=True))[10:]:
+        assert state.status is Status.TRACKING
+        assert 0.1 < 1 - state.seen.mean() < 0.25
+        assert error(state, truth).rms < 0.5
+
+
 def test_a_hidden_end_is_held_and_taken_up_again(rig: StereoRig) -> None:
     truths = [thread(i / FPS) for i in range(36)]
     fields = []
@@ -459,6 +477,22 @@ def test_what_moves_outside_the_images_is_gone_until_it_comes_in(rig: StereoRig)
     inside = replace(at_rest, control_points=at_rest.control_points - [60.0, 0.0, 0.0])
     doubt.grow(inside, inside, inside, seen, rig)
     assert not (doubt.gone | doubt.anywhere).any()
+
+
+def test_a_hidden_end_is_where_it_was_on_a_thread_that_jumps_as_a_whole(rig: StereoRig) -> None:
+    points = np.stack([np.linspace(-60, 60, 8), np.zeros(8), np.full(8, 300.0)], axis=1)
+    knots = nurbs.clamped_knots(np.linspace(0, 1, 6)[1:-1], 3)
+    seen = np.arange(RELIABILITY_SAMPLES) < 0.8 * RELIABILITY_SAMPLES
+    doubt = Doubt()
+    for i in range(20):
+        here, there = (
+            nurbs.curve_from(3, knots, points + np.array([0.0, shift, 0.0]))
+            for shift in (0.0, 0.5 * (-1) ** i)
+        )
+        doubt.grow(here, here, there, seen, rig)
+    assert not doubt.px[seen].any()
+    assert 0.5 < doubt.px[-1] < 5.0
+    assert not doubt.anywhere.any()
 
 
 def test_two_threads_keep_their_names(rig: StereoRig) -> None:

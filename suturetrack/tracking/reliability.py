@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import binary_opening
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
@@ -31,6 +32,9 @@ _DRIFT_AT_REST_PX = 0.2
 # How much of its drift is left to what moves as most of the thread does.
 _TOGETHER = 0.2
 _ANYWHERE_PX, _HOPELESS_PX, _MOVED_PX = 5.0, 15.0, 2.0
+# How far a hidden stretch bulges, of the way along it to what is seen, and what share of the curve has to be
+# seen on both of its sides to hold it.
+_BULGE, _HOLD = 0.15, 0.12
 _GAP = 5
 _BORDER_PX = 10.0
 
@@ -138,7 +142,8 @@ class Doubt:
 
     It grows with the curve's own motion there: a hidden stretch of a thread at rest stays where it
     was, and one that moves as the rest does goes on with it; one that was moving fast by itself may be
-    anywhere. What comes into the images is looked for anew.
+    anywhere, but for what a stretch that is held on both sides can bulge. What comes into the images is
+    looked for anew.
     """
 
     def __init__(self) -> None:
@@ -162,17 +167,13 @@ class Doubt:
         places = [rig.project(values_at(curve, s))[0] for curve in curves]
         both = views(rig, values_at(after, s), values_at(after, s, 1))
         outside = ~np.all([view.inside(rig.image_size, _BORDER_PX) for view in both], axis=0)
-        steps = places[2] - places[0]
-        moved = np.linalg.norm(steps, axis=1)
-        if seen.any():
-            along = np.linalg.norm(steps - np.median(steps[seen], axis=0), axis=1)
-            moved = np.minimum(moved, along + _TOGETHER * moved)
-        surprise = np.linalg.norm(places[2] - places[1], axis=1)
+        moved, surprise = (_own_lengths(places[2] - place, seen) for place in places[:2])
         if seen.any():
             surprise = np.interp(s, s[seen], surprise[seen])
         drift = _DRIFT * moved + surprise + _DRIFT_AT_REST_PX
         comes_in = self.outside & ~outside
-        self.px = np.where(seen | comes_in, 0.0, np.hypot(self.px, drift))
+        doubted = np.minimum(np.hypot(self.px, drift), _BULGE * _from_held(seen, places[2]))
+        self.px = np.where(seen | comes_in, 0.0, doubted)
         self.outside = outside
 
     def cut(self, start: int, stop: int) -> None:
@@ -195,6 +196,26 @@ class Doubt:
     def gone(self) -> Bool:
         """(k,) what is surely elsewhere outside the images, where it cannot be looked for."""
         return (self.px > _HOPELESS_PX) & self.outside
+
+
+def _own_lengths(steps: Float64, seen: Bool) -> Float64:
+    """(k,) lengths of (k, 2) steps, without most of what is common to those that are seen."""
+    lengths = np.linalg.norm(steps, axis=1)
+    if not seen.any():
+        return lengths
+    apart = np.linalg.norm(steps - np.median(steps[seen], axis=0), axis=1)
+    return np.minimum(lengths, apart + _TOGETHER * lengths)
+
+
+def _from_held(seen: Bool, places: Float64) -> Float64:
+    """(k,) way along (k, 2) places to the nearer of the long seen stretches around, px; infinite where
+    there is none on one side."""
+    held = binary_opening(seen, np.ones(round(_HOLD * len(seen)), bool))
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
+    before = np.maximum.accumulate(np.where(held, along, -np.inf))
+    after = np.minimum.accumulate(np.where(held, along, np.inf)[::-1])[::-1]
+    is_between = np.isfinite(before) & np.isfinite(after)
+    return np.where(is_between, np.minimum(along - before, after - along), np.inf)
 
 
 class HiddenEnds:

@@ -29,7 +29,7 @@ _RAREST = 3
 # After so many in vain, some 5 s, it may have been cut or drawn out meanwhile: what is sure to be a thread
 # may have any length.
 _ATTEMPTS = 12
-# A thread that was never sure is no stub of what it was found as, against the longest.
+# A thread that was never sure is no stub of what it was found as with some hope, against the longest.
 _STUB = 0.5
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
@@ -287,7 +287,8 @@ class Thread:
             self._sureness,
         )
         self._rest = self._failures = 0
-        self._longest = max(self._longest, state.length)
+        if not self._sureness.is_hopeless:
+            self._longest = max(self._longest, state.length)
         self._come_to(replace(state, events=(event, *state.events)))
 
     @property
