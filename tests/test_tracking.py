@@ -467,6 +467,7 @@ def test_what_moves_outside_the_images_is_gone_until_it_comes_in(rig: StereoRig)
     for i in range(40):
         before, after = swung_out(5.0 * i), swung_out(5.0 * (i + 1))
         doubt.grow(before, after, after, seen, rig)
+        assert doubt.gone[-1] == (doubt.px[-1] > 8.0)
     assert not doubt.px[seen].any()
     assert doubt.gone[-5:].all()
     assert not doubt.gone[seen].any()

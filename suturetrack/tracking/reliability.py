@@ -31,7 +31,7 @@ _DRIFT = 0.35
 _DRIFT_AT_REST_PX = 0.2
 # How much of its drift is left to what moves as most of the thread does.
 _TOGETHER = 0.2
-_ANYWHERE_PX, _HOPELESS_PX, _MOVED_PX = 5.0, 15.0, 2.0
+_ANYWHERE_PX, _HOPELESS_PX, _GONE_PX, _MOVED_PX = 5.0, 15.0, 8.0, 2.0
 # How far a hidden stretch bulges, of the way along it to what is seen, and what share of the curve has to be
 # seen on both of its sides to hold it.
 _BULGE, _HOLD = 0.15, 0.12
@@ -194,8 +194,8 @@ class Doubt:
 
     @property
     def gone(self) -> Bool:
-        """(k,) what is surely elsewhere outside the images, where it cannot be looked for."""
-        return (self.px > _HOPELESS_PX) & self.outside
+        """(k,) what has moved far outside the images, where it cannot be looked for."""
+        return (self.px > _GONE_PX) & self.outside
 
 
 def _own_lengths(steps: Float64, seen: Bool) -> Float64:
