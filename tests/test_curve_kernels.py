@@ -1,10 +1,15 @@
+import importlib
+import inspect
+import pkgutil
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numba.core.dispatcher import Dispatcher
 
-from suturetrack import nurbs
+from suturetrack import kernels, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import rows, search, spline
 from tests.reference import curve_fit as reference
@@ -13,6 +18,19 @@ from tests.reference import strands as strands_reference
 RNG = np.random.default_rng(3)
 KNOTS = nurbs.clamped_knots(np.array([0.07, 0.2, 0.45, 0.5, 0.81]), 3)
 S = np.sort(np.r_[0.0, RNG.uniform(0, 1, 40), 1.0])
+
+
+def test_no_kernel_has_defaults() -> None:
+    """For a call that leaves one out, it is compiled anew, in the midst of a run."""
+    modules = [
+        importlib.import_module(f"{kernels.__name__}.{module.name}")
+        for module in pkgutil.iter_modules(kernels.__path__)
+    ]
+    found = [f for m in modules for f in vars(m).values() if isinstance(f, Dispatcher)]
+    assert len(found) > 20
+    for kernel in found:
+        parameters = inspect.signature(kernel.py_func).parameters.values()
+        assert all(p.default is p.empty for p in parameters), kernel
 
 
 def test_the_local_basis_is_that_of_scipy() -> None:

@@ -75,7 +75,7 @@ def magnitudes(field: Float32, pixels: Float64) -> Float64:
 
 @numba.njit(cache=True, nogil=True)
 def normal_profiles(
-    field: Float32, pixels: Float64, tangents: Float64, offsets: Float64, leniency: float = 0.0
+    field: Float32, pixels: Float64, tangents: Float64, offsets: Float64, leniency: float
 ) -> Float64:
     """(k, m) responses at the m offsets along the normals (-tv, tu) of the k samples.
 

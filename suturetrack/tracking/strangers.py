@@ -115,7 +115,8 @@ def _around(pixels: Float64, shape: tuple[int, ...], margin: float) -> tuple[sli
 def _half_width(image: Float32, view: View, level: float) -> float:
     """How far from its middle the thread's ridge reaches, px."""
     offsets: Float64 = np.arange(_WIDEST_PX + 1.0)
-    profile = np.median(search.normal_profiles(image, view.pixels, view.tangents, offsets), axis=0)
+    profiles = search.normal_profiles(image, view.pixels, view.tangents, offsets, 0.0)
+    profile = np.median(profiles, axis=0)
     return float(np.argmax(profile < _NOTHING * level))
 
 
