@@ -207,13 +207,19 @@ def test_an_end_that_is_hidden_for_a_moment_makes_the_thread_no_shorter(rig: Ste
     assert states[-1].length == pytest.approx(100.0, rel=0.01)
 
 
-def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:
-    truths = [thread(i / FPS) for i in range(30)]
+def with_hidden_middle(
+    rig: StereoRig, truths: Sequence[np.ndarray], radius: float
+) -> list[RidgeField]:
     fields = []
     for i, points in enumerate(truths):
         u, v = rig.project(points[300])[0]
-        fields.append(paint(rig, [points], i, [(u, v, 22.0)] if i >= 8 else []))
-    states = follow(fields, rig, seed_on(rig, truths[0]))
+        fields.append(paint(rig, [points], i, [(u, v, radius)] if i >= 8 else []))
+    return fields
+
+
+def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:
+    truths = [thread(i / FPS) for i in range(30)]
+    states = follow(with_hidden_middle(rig, truths, 22.0), rig, seed_on(rig, truths[0]))
     for state, truth in list(zip(states, truths, strict=True))[10:]:
         assert state.status is Status.TRACKING
         assert not state.seen[32:35].any()
@@ -233,11 +239,7 @@ def test_what_hides_much_of_the_middle_does_not_lose_a_thread_that_is_shaken(
     truths = [
         thread(i / FPS) + 0.5 * np.array([np.sin(1.1 * i), np.cos(1.7 * i), 0.0]) for i in range(60)
     ]
-    fields = []
-    for i, points in enumerate(truths):
-        u, v = rig.project(points[300])[0]
-        fields.append(paint(rig, [points], i, [(u, v, 30.0)] if i >= 8 else []))
-    states = follow(fields, rig, seed_on(rig, truths[0]))
+    states = follow(with_hidden_middle(rig, truths, 30.0), rig, seed_on(rig, truths[0]))
     for state, truth in list(zip(states, truths, strict=True))[10:]:
         assert state.status is Status.TRACKING
         assert 0.1 < 1 - state.seen.mean() < 0.25
