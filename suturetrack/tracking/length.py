@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from suturetrack.nurbs import length as length_of
 from suturetrack.tracking.ends import EndWatch
+from suturetrack.types import Nurbs
 
 # A thread of which something is hidden has not grown by more.
 _GROWTH = 0.02
@@ -92,3 +94,14 @@ class KnownLength:
     def is_beyond_hope(self, length: float) -> bool:
         """Whether a curve has little of the thread's length left, or far too much added."""
         return length < _LEAST_LEFT * self.now or length > _MOST_ADDED * max(self.possible)
+
+
+def has_length(curve: Nurbs, known_lengths: tuple[float, ...]) -> bool:
+    """Whether the curve is as long as the thread is known to be; any is where nothing is known."""
+    return not known_lengths or length_error(curve, known_lengths) < _TOLERANCE
+
+
+def length_error(curve: Nurbs, known_lengths: tuple[float, ...]) -> float:
+    """How far the curve's length is from the nearest known one, as a share of that."""
+    actual = length_of(curve)
+    return min(abs(actual / known - 1) for known in known_lengths)

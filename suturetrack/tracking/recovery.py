@@ -16,16 +16,16 @@ from suturetrack.initialization import (
 )
 from suturetrack.kernels import search
 from suturetrack.metrics import polyline_length
-from suturetrack.nurbs import evaluate, length, reversed_curve, tangents
+from suturetrack.nurbs import evaluate, reversed_curve, tangents
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
+from suturetrack.tracking.length import has_length
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import Neighbours, Strand
 from suturetrack.types import Bool, Float64, Nurbs, RidgeField, Seed
 
 _PLACES = 24
 _SEEDS = 2
-_LENGTH_TOLERANCE = 0.05
 # Threads that lie on one another do so for less of their length.
 _SHARED = 0.3
 _EVENLY = np.linspace(0, 1, 4 * _PLACES)
@@ -97,17 +97,6 @@ def starts_on(last: Nurbs, seed: Seed, field: RidgeField, rig: StereoRig) -> lis
     chosen = [best[0], *far[: _SEEDS - 1]]
     clear = points[chosen][shown[chosen] > 0]
     return [*(Seed(seed.thread, point=(float(x), float(y), float(z))) for x, y, z in clear), seed]
-
-
-def has_length(curve: Nurbs, known_lengths: tuple[float, ...]) -> bool:
-    """Whether the curve is as long as the thread is known to be; any is where nothing is known."""
-    return not known_lengths or length_error(curve, known_lengths) < _LENGTH_TOLERANCE
-
-
-def length_error(curve: Nurbs, known_lengths: tuple[float, ...]) -> float:
-    """How far the curve's length is from the nearest known one, as a share of that."""
-    actual = length(curve)
-    return min(abs(actual / known - 1) for known in known_lengths)
 
 
 def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:

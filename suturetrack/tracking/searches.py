@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.tracking.follower import Follower
+from suturetrack.tracking.length import has_length, length_error
 from suturetrack.tracking.pursuit import Pursuit
 from suturetrack.tracking.recovery import (
     Setup,
     directed,
     doubting_ends,
     find_again,
-    has_length,
-    length_error,
     lies_on,
     starts_on,
 )

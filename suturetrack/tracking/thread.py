@@ -11,9 +11,10 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.nurbs import evaluate
 from suturetrack.tracking.follower import Follower
+from suturetrack.tracking.length import has_length
 from suturetrack.tracking.looks import Look, Outcome
 from suturetrack.tracking.pursuit import Pursuit
-from suturetrack.tracking.recovery import Setup, has_length
+from suturetrack.tracking.recovery import Setup
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.tracking.searches import Again, Closer, FromSeed, Search, lengths
 from suturetrack.tracking.strands import Neighbours
