@@ -379,20 +379,20 @@ def test_what_was_never_sure_does_not_tell_the_length_but_is_no_stub(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch, first: float, hope: float, later: float
 ) -> None:
     """But for what was found with next to no hope, which may be anything."""
-    truths, away = [thread(i / FPS) for i in range(FPS)], range(3, 14)
-    for points in truths[away.stop :]:
-        points[:, 1] += 15.0
+    whole, away = [thread(i / FPS) for i in range(FPS)], range(3, 14)
+    down = np.array([0.0, 15.0, 0.0])
+    rest = [points[: round(later * len(points))] + down for points in whole[away.stop :]]
+    truths = [*whole[: away.stop], *rest]
 
     def look(field: RidgeField, rig: StereoRig, *_: object) -> Initialization:
         number = field.stamp.frame
         found = initialize(field, rig, seed_on(rig, truths[number]))
-        part, confidence = (later, 0.9) if number else (first, hope)
+        part, confidence = (1.0, 0.9) if number else (first, hope)
         return replace(found, curve=nurbs.part(found.curve, 0.0, part), confidence=confidence)
 
     looks_by(monkeypatch, look)
     states = follow(rig, truths, away)
-    whole = metrics.polyline_length(truths[0])
-    assert states[0].length == pytest.approx(first * whole, rel=0.1)
+    assert states[0].length == pytest.approx(first * metrics.polyline_length(whole[0]), rel=0.1)
     assert states[away[-1]].status is Status.LOST
     if later == 1.0:
         assert states[-1].status is Status.TRACKING

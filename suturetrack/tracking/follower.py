@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +40,8 @@ _NS = 1e-9
 _WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
 _ENOUGH, _GAIN = 0.97, 0.02
 _DROP = 0.01
+# An end that is drawn out further than the first is looked at again in the same field, so often at most.
+_LEAP_PX, _LEAPS = 5.0, 6
 _RETRY = 5
 _NOISE_SIGMAS = 3.0
 _ALL = 0.97
@@ -90,12 +93,21 @@ class Follower:
         self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
         self._share = 1.0
+        self._comes_in = False
+        """Whether the thread has been coming into the images since it was cut by their border."""
+        self._leaps: Bool = np.zeros(2, bool)
+        """Whether the ends were drawn out so far in the last field that there may be more."""
         self._mouths = Mouth(), Mouth()
         self.model = Model(curve, Motion.none(), levels, now, now, EndWatch(length_of(curve), now))
 
     def remember(self, before: Follower, *, is_sure: bool) -> None:
         """Takes over what was known of the thread's length before it was found anew."""
-        self.known_length = self.known_length.inherited(before.known_length, is_sure=is_sure)
+        known = self.known_length = self.known_length.inherited(
+            before.known_length, is_sure=is_sure
+        )
+        self.model.ends = EndWatch(
+            length_of(self.model.curve), self.model.capture_ns, max(known.possible)
+        )
 
     def came_from(self, before: Nurbs, seconds: float) -> None:
         """Tells where the thread was found so many seconds ago."""
@@ -133,13 +145,11 @@ class Follower:
             evidence, inserted, removed = self._follow_by_least_squares(
                 field, predicted, neighbours
             )
-        seen = self._seen = evidence.evenly_seen
-        self._doubt.grow(before, predicted, model.curve, seen, self.rig)
-        if self.config.method != "paper":
-            told = seen & evidence.alone
-            model.motion = model.motion.learn(
-                before, model.curve, told, model.ends.seen, self.rig, seconds
-            )
+            self._learn_motion(before, evidence, seconds)
+        self._doubt.grow(before, predicted, model.curve, evidence.evenly_seen, self.rig)
+        for further, more, fewer in self._follow_into_sight(field, neighbours):
+            evidence, inserted, removed = further, inserted + more, removed + fewer
+        self._seen = evidence.evenly_seen
         if evidence.share >= 0.5:
             model.seen_ns = model.capture_ns
             self._learn_levels(field)
@@ -196,15 +206,17 @@ class Follower:
         return wrong, (model.capture_ns - self._certain_ns) * _NS
 
     def _status(self, evidence: Evidence, plain: Bool, uncertain_s: float) -> Status:
-        """The status; a curve that was lost must have its length again to be held."""
+        """The status; a curve that was lost must have its length again, and be seen, to be held."""
         model, known, noise = self.model, self.known_length, _noise(evidence)
         length, is_clear = length_of(model.curve), _is_clear(plain, evidence)
         last = length_of(self.last_good)
-        if self._lost and known.is_another(length, last, noise, is_clear=is_clear):
+        is_another = known.is_another(length, last, noise, is_clear=is_clear)
+        if self._lost and (is_another or plain.mean() < 1 - ASTRAY):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
         is_vague = self._doubt.gone.mean() > ASTRAY
         is_vague |= any(self._hidden.for_longer_than(_HIDDEN_S))
+        is_vague |= bool(self._leaps.any()) and not known.is_reached(length)
         makes_detour = not is_clear and known.is_exceeded(length, noise)
         if status is Status.TRACKING and (is_vague or makes_detour):
             return Status.OCCLUDED
@@ -271,13 +283,38 @@ class Follower:
     ) -> tuple[Evidence, int, int]:
         model = self.model
         best = self._search(predicted, field, neighbours.shown_in(field, model.levels))
-        model.curve = best.fit.curve
+        model.curve, self._leaps = best.without_half_seen_tips(), np.zeros(2, bool)
         if best.share > 0.3:
             known = covered(best.fit.views(self.rig), neighbours)
-            self._adjust_ends(field, best.fit.crowded, known)
+            cut = length_of(best.fit.curve) / length_of(model.curve) - 1.0
+            self._adjust_ends(field, best.fit.crowded, known, cut)
         self._cut_doubled_ends()
         model.curve, inserted, removed = rearrange(model.curve, self.rig)
         return best, inserted, removed
+
+    def _learn_motion(self, before: Nurbs, evidence: Evidence, seconds: float) -> None:
+        """An end that comes into sight does not move as fast as it is drawn out."""
+        model, told = self.model, evidence.evenly_seen & evidence.alone
+        first, last = np.array(model.ends.seen) & ~self._leaps
+        model.motion = model.motion.learn(
+            before, model.curve, told, (first, last), self.rig, seconds
+        )
+
+    def _follow_into_sight(
+        self, field: RidgeField, neighbours: Neighbours
+    ) -> Iterator[tuple[Evidence, int, int]]:
+        """Goes on in the same field while an end is drawn out far: by no more than the thread was long, for
+        fear of a tool, or than comes in at the border."""
+        model = self.model
+        self._comes_in = model.ends.at_border or (self._comes_in and bool(self._leaps.any()))
+        for _ in range(_LEAPS):
+            before = model.curve
+            may_be_longer = length_of(before) < max(self.known_length.possible)
+            if not (self._leaps.any() and (self._comes_in or may_be_longer)):
+                return
+            step = self._follow_by_least_squares(field, before, neighbours)
+            self._doubt.grow(before, before, model.curve, step[0].evenly_seen, self.rig)
+            yield step
 
     def _cut_doubled_ends(self) -> None:
         """Cuts off what has folded; a tip may lie on its own thread, where the curve is not too long."""
@@ -316,8 +353,15 @@ class Follower:
         self._share = best.share
         return best
 
-    def _adjust_ends(self, field: RidgeField, crowded: Bool, known: Bool) -> None:
-        """Moves the ends; (k,) samples are `crowded` by other ridges, or on threads that are `known`."""
+    def _adjust_ends(self, field: RidgeField, crowded: Bool, known: Bool, cut: float) -> None:
+        """Moves the ends.
+
+        Args:
+            field: what shows them.
+            crowded: (k,) samples beside other ridges.
+            known: (k,) samples on other threads.
+            cut: what tips were cut off to be found anew, as a part of the length that is left.
+        """
         model = self.model
         steps = [
             self._end_step(end, field, bool(crowded[tip].any()), bool(known[tip].any()))
@@ -332,6 +376,12 @@ class Follower:
         )
         if start or stop:
             model.curve = _with_ends(model.curve, -start, 1.0 + stop)
+        self._leaps = np.array(
+            [
+                step is not None and min(moved, start + stop - cut) > _LEAP_PX * step.pixel
+                for step, moved in zip(steps, (start, stop), strict=True)
+            ]
+        )
 
     def _end_step(
         self, end: int, field: RidgeField, crowded: bool, on_another: bool

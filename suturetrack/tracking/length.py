@@ -81,6 +81,10 @@ class KnownLength:
         """Whether a curve beside other ridges, which draw it aside, makes a detour."""
         return self.is_established and length > (1 + _DETOUR) * self.now + noise
 
+    def is_reached(self, length: float) -> bool:
+        """Whether a curve lacks nothing of the thread's own length."""
+        return self.is_established and length >= self.now
+
     def is_short(self, length: float) -> bool:
         """Whether a curve lacks what was cut off."""
         return self.is_cut and length < (1 - _TOLERANCE) * self.now

@@ -11,6 +11,7 @@ from scipy.ndimage import binary_opening
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.kernels.search import Int64
+from suturetrack.nurbs import part
 from suturetrack.tracking.gauss_newton import Fit
 from suturetrack.tracking.sampling import View, values_at, views
 from suturetrack.tracking.strands import SAME_STRAND_PX, Neighbours, Strand
@@ -36,6 +37,8 @@ _ANYWHERE_PX, _HOPELESS_PX, _GONE_PX, _MOVED_PX = 5.0, 15.0, 8.0, 2.0
 # seen on both of its sides to hold it.
 _BULGE, _HOLD = 0.15, 0.12
 _GAP = 5
+# Share of the curve that the tips are at most.
+_TIPS = 0.1
 _BORDER_PX = 10.0
 
 
@@ -58,6 +61,15 @@ class Evidence:
             near = np.abs(fit.residual) < _NEAR_PX
         seen, hidden = np.all(near, axis=1), ~np.any(near, axis=1)
         return cls(fit, seen, hidden, float(np.sum(fit.samples.share * seen)))
+
+    def without_half_seen_tips(self) -> Nurbs:
+        """The curve without what only one image shows of it at its ends, if that is little: its depth is
+        unknown, and it is found anew."""
+        half, s = ~(self.seen | self.hidden), self.fit.samples.s
+        start, stop = (int(np.argmin(flags)) for flags in (half, half[::-1]))
+        if not 0 < start + stop <= _TIPS * len(half):
+            return self.fit.curve
+        return part(self.fit.curve, s[start] if start else 0.0, s[-1 - stop] if stop else 1.0)
 
     @cached_property
     def sigma(self) -> Float64:
