@@ -283,7 +283,9 @@ class Follower:
     ) -> tuple[Evidence, int, int]:
         model = self.model
         best = self._search(predicted, field, neighbours.shown_in(field, model.levels))
-        model.curve, self._leaps = best.without_half_seen_tips(), np.zeros(2, bool)
+        # What was just drawn out may have been drawn out in depth.
+        model.curve = best.without_half_seen_tips() if self._leaps.any() else best.fit.curve
+        self._leaps = np.zeros(2, bool)
         if best.share > 0.3:
             known = covered(best.fit.views(self.rig), neighbours)
             cut = length_of(best.fit.curve) / length_of(model.curve) - 1.0
