@@ -16,7 +16,16 @@ import pytest
 
 from services import topics
 from services.bus import Bus
-from services.doctor import ERROR, OK, WARNING, DoctorConfig, certificates, examine, listening
+from services.doctor import (
+    ERROR,
+    OK,
+    WARNING,
+    DoctorConfig,
+    Finding,
+    certificates,
+    examine,
+    listening,
+)
 from services.keys import KeysConfig, init
 from services.messages import Health, Latency
 from services.status import StatusConfig, run, watch_rigs
@@ -36,6 +45,7 @@ HEALTHY = Health(
     refused=0,
     memory_mb=200.0,
 )
+WAITING = replace(HEALTHY, frames=0, rate_hz=0.0)
 
 
 @pytest.fixture
@@ -92,20 +102,26 @@ def test_troubles_of_a_running_system_are_named(rig: Bus) -> None:
     )
 
 
-def test_a_process_that_waits_is_no_trouble_of_its_own(rig: Bus) -> None:
-    waits = replace(HEALTHY, frames=0, rate_hz=0.0)
-    alone = replace(waits, process="tracker", warning="waits for the source", awaits="source")
-    say(rig, alone)
-    advice = {f.subject: f for f in examine(DoctorConfig(rig.rig))}
-    found = advice[f"{rig.rig}: tracker"]
+def test_a_process_that_waits_for_another_is_no_trouble_of_its_own(rig: Bus) -> None:
+    alone = replace(WAITING, process="tracker", warning="waits for the source", awaits="source")
+    found = _advice(rig, "tracker", alone)
     assert (found.level, found.text) == (WARNING, "waits for the source")
     assert found.advice == "start the source, as above; this process then goes on by itself"
-    unready = replace(waits, process="segmenter", warning="waits for the tracker", awaits="tracker")
-    say(rig, waits, unready, replace(waits, process="tracker"))
-    advice = {f.subject: f for f in examine(DoctorConfig(rig.rig))}
-    found = advice[f"{rig.rig}: segmenter"]
+
+
+def test_a_process_that_waits_for_one_that_runs_goes_on_by_itself(rig: Bus) -> None:
+    unready = replace(
+        WAITING, process="segmenter", warning="waits for the tracker", awaits="tracker"
+    )
+    found = _advice(rig, "segmenter", WAITING, unready, replace(WAITING, process="tracker"))
     assert (found.level, found.text) == (WARNING, "waits for the tracker")
     assert found.advice == "it goes on by itself; if it does not, see the log of the tracker"
+
+
+def _advice(rig: Bus, process: str, *healths: Health) -> Finding:
+    """What the doctor finds last about one process; once a bus, for an earlier reader goes late."""
+    say(rig, *healths)
+    return {f.subject: f for f in examine(DoctorConfig(rig.rig))}[f"{rig.rig}: {process}"]
 
 
 def test_certificates_near_their_end_are_named(tmp_path: Path) -> None:
@@ -129,6 +145,7 @@ def test_status_shows_processes_and_threads(rig: Bus, capsys: pytest.CaptureFixt
     )
     say(rig, replace(HEALTHY, warning="cable loose"))
     watches = watch_rigs(rig.rig, None, 1.0)
+    assert rig.wait_for_readers(topics.STATE, 10)
     rig.publish(topics.STATE, state)
     watch = watches[rig.rig]
     deadline = time.monotonic() + 10
