@@ -24,7 +24,7 @@ from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.recovery import Setup, directed, doubting_ends
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.searches import FromSeed
-from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
+from suturetrack.tracking.strands import Neighbours, Strand
 from suturetrack.tracking.sureness import Sureness
 from suturetrack.types import RidgeField, Seed, Status, ThreadState
 from tests.painting import FPS, paint, thread
@@ -595,11 +595,34 @@ def test_an_end_that_runs_along_another_thread_leaves_a_look_in_doubt(rig: Stere
         end = nurbs.evaluate(doubted.curve, np.array([place]))[0]
         assert np.linalg.norm(end - points[450]) < 1.5
     first = FromSeed(seed, Setup(rig, TrackingConfig(), InitializationConfig()), None)
-    alone, doubted, same = (
-        first.find(field, others) for others in (NOBODY, strands(along), strands(points))
-    )
-    assert isinstance(alone, Initialization)
-    assert isinstance(doubted, Initialization)
-    assert isinstance(same, Initialization)
-    assert doubted.confidence == pytest.approx(0.3 * alone.confidence)
-    assert same.confidence == alone.confidence
+    for other, left in ((along, 0.27), (points[250:], 0.27), (points, 0.9)):
+        assert first.beside(strands(other), found).confidence == pytest.approx(left)
+
+
+@pytest.mark.parametrize("shared", [0.25, 0.5])
+@pytest.mark.parametrize("names", ["ab", "ba"])
+def test_of_threads_found_in_one_field_the_surest_counts(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, names: str, shared: float
+) -> None:
+    x = np.linspace(-25, 25, 600)
+    sure = np.c_[x, 0.01 * x**2, np.full(600, 200.0)]
+    turns_off = sure[round((1 - shared) * 600)]
+    own = turns_off + np.c_[-x - 25, -0.4 * (x + 25), np.zeros(600)][::-1]
+    runs_on = np.r_[own[:-1], sure[sure[:, 0] >= turns_off[0]]]
+    found = {
+        "a": (runs_on, seed_on(rig, own, "a"), 0.6),
+        "b": (sure, Seed("b", pixel=seed_on(rig, sure).pixel), 0.9),
+    }
+
+    def look(_field: RidgeField, _rig: StereoRig, seed: Seed, *_: object) -> Initialization:
+        points, _, confidence = found[seed.thread]
+        alone = initialize(paint(rig, [points], 0), rig, seed)
+        return replace(alone, confidence=confidence, doubts=((), ()))
+
+    looks_by(monkeypatch, look)
+    tracker = Tracker(rig)
+    for name in names:
+        tracker.seed(found[name][1])
+    states = {s.thread: s for s in tracker.step(paint(rig, [own, sure], 0)).states}
+    assert states["a"].status is Status.OCCLUDED
+    assert states["b"].status is Status.TRACKING

@@ -52,9 +52,14 @@ class Look:
         """The name of the thread."""
         return self.search.seed.thread
 
-    def at_once(self, others: Neighbours) -> None:
-        """Looks while the caller waits."""
-        self._begin(self.field, others)
+    def at_once(self) -> float:
+        """Looks while the caller waits; how sure it is of what was found, for `follow` to go on with."""
+        found = self._outcome.found = self.search.find(self.field)
+        return found.confidence if isinstance(found, Initialization) else 0.0
+
+    def follow(self, others: Neighbours) -> None:
+        """Goes on with what was found at once, beside what is held by now."""
+        self._go_on(self.field, others)
 
     def add(self, worker: Executor, field: RidgeField, others: Neighbours) -> None:
         """Hands on the next field, the one of the look first, to a worker that keeps their order."""
@@ -73,7 +78,13 @@ class Look:
         return self._outcome
 
     def _begin(self, field: RidgeField, others: Neighbours) -> None:
-        found = self._outcome.found = self.search.find(field, others)
+        self._outcome.found = self.search.find(field)
+        self._go_on(field, others)
+
+    def _go_on(self, field: RidgeField, others: Neighbours) -> None:
+        if isinstance(self._outcome.found, Initialization):
+            self._outcome.found = self.search.beside(others, self._outcome.found)
+        found = self._outcome.found
         if isinstance(found, Initialization):
             self._outcome.pursuit = self.search.pursue(found, field)
             self._follow(field, others)

@@ -28,6 +28,8 @@ _PLACES = 24
 _SEEDS = 2
 # Threads that lie on one another do so for less of their length.
 _SHARED = 0.3
+# And what is the same thread, found once more, for almost all of it.
+_SAME = 0.9
 _EVENLY = np.linspace(0, 1, 4 * _PLACES)
 # How near and for how long an end may run along another thread, and what more leaves of the confidence.
 _BESIDE_PX, _LONGEST_PX, _DOUBTED = 5.0, 12.0, 0.3
@@ -102,6 +104,11 @@ def starts_on(last: Nurbs, seed: Seed, field: RidgeField, rig: StereoRig) -> lis
 def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
     """Whether much of the curve lies on the strands of other threads, in both images."""
     return bool(np.mean(_shared(curve, others, rig, search.APART_PX)) > _SHARED)
+
+
+def is_one_of(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
+    """Whether almost all of the curve lies on the strands of other threads, in both images."""
+    return bool(np.mean(_shared(curve, others, rig, _BESIDE_PX)) > _SAME)
 
 
 def doubting_ends(found: Initialization, others: Neighbours, rig: StereoRig) -> Initialization:

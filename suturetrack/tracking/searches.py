@@ -14,6 +14,7 @@ from suturetrack.tracking.recovery import (
     directed,
     doubting_ends,
     find_again,
+    is_one_of,
     lies_on,
     starts_on,
 )
@@ -33,16 +34,18 @@ class FromSeed:
     toward: Nurbs | None
     """A curve that tells its direction."""
 
-    def find(self, field: RidgeField, others: Neighbours) -> Found:
-        """The thread through the seed, which may be one of the others, or why there is none."""
+    def find(self, field: RidgeField) -> Found:
+        """The thread through the seed, or why there is none."""
         try:
             found = self.setup.look(field, self.seed)
         except InitializationError as error:
             return error
-        rig = self.setup.rig.with_row_offset(found.row_offset_px)
-        if not lies_on(found.curve, others, rig):
-            found = doubting_ends(found, others, rig)
         return found if self.toward is None else directed(found, self.toward)
+
+    def beside(self, others: Neighbours, found: Initialization) -> Found:
+        """What was found, which may be one of the other threads."""
+        rig = self.setup.rig.with_row_offset(found.row_offset_px)
+        return found if is_one_of(found.curve, others, rig) else doubting_ends(found, others, rig)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows the first curve."""
@@ -66,17 +69,18 @@ class Again:
     turn: int | None
     """From which of the places a brief search begins; None for one that takes all the time."""
 
-    def find(self, field: RidgeField, others: Neighbours) -> Found:
-        """A thread of the known length that is none of the others."""
+    def find(self, field: RidgeField) -> Found:
+        """A thread of the known length."""
         starts = starts_on(self.last, self.seed, field, self.rig)
         is_brief, first = self.turn is not None, (self.turn or 0) % len(starts)
         starts = starts[first:] + starts[:first]
-        found = find_again(
+        return find_again(
             self.last, self.known_lengths, starts, field, self.setup, is_brief=is_brief
         )
-        if found is None or lies_on(found.curve, others, self.rig):
-            return None
-        return doubting_ends(found, others, self.rig)
+
+    def beside(self, others: Neighbours, found: Initialization) -> Found:
+        """What was found, unless it is one of the other threads."""
+        return _none_of(others, found, self.rig)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows the thread, with what was known of its length."""
@@ -96,21 +100,28 @@ class Closer:
     before: tuple[Follower, ...]
     """Who knows how long the thread is."""
 
-    def find(self, field: RidgeField, others: Neighbours) -> Found:
-        """A thread of the known length through the place of the seed that is none of the others."""
+    def find(self, field: RidgeField) -> Found:
+        """A thread of the known length through the place of the seed."""
         try:
             found = self.setup.look(field, self.seed)
         except (InitializationError, InputError):  # The place may have left the image.
             return None
-        rig = self.setup.rig.with_row_offset(found.row_offset_px)
-        if lies_on(found.curve, others, rig) or not has_length(found.curve, lengths(self.before)):
+        if not has_length(found.curve, lengths(self.before)):
             return None
-        return directed(doubting_ends(found, others, rig), self.followed)
+        return directed(found, self.followed)
+
+    def beside(self, others: Neighbours, found: Initialization) -> Found:
+        """What was found, unless it is one of the other threads."""
+        return _none_of(others, found, self.setup.rig.with_row_offset(found.row_offset_px))
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows what this look found."""
         before = _who_knew(found.curve, self.before)
         return Pursuit(found, field, self.seed, self.setup, before)
+
+
+def _none_of(others: Neighbours, found: Initialization, rig: StereoRig) -> Initialization | None:
+    return None if lies_on(found.curve, others, rig) else doubting_ends(found, others, rig)
 
 
 Search = FromSeed | Again | Closer

@@ -144,22 +144,26 @@ class Tracker:
         Args:
             held: the threads that were held before this field, which must not be held up.
         """
+        at_once: list[tuple[float, Thread, Look]] = []
         for thread in sorted(self._threads.values(), key=lambda thread: thread.looked_ns):
             if self._look is not None:
-                return
+                break
             is_beside = bool(held - {thread.name})
             search = thread.search(field.stamp.capture_ns, is_beside)
             if search is None:
                 continue
-            own, others = field.of(thread.name), self._others(thread, field.stamp)
+            own = field.of(thread.name)
             look = Look(search, own)
             if is_beside or isinstance(search, Closer):
-                look.add(self._worker, own, others)
+                look.add(self._worker, own, self._others(thread, field.stamp))
                 self._look = look
             else:
-                look.at_once(others)
-                thread.take_up(look, others)
-                yield look
+                at_once.append((look.at_once(), thread, look))
+        for _, thread, look in sorted(at_once, key=lambda found: -found[0]):
+            others = self._others(thread, field.stamp)
+            look.follow(others)
+            thread.take_up(look, others)
+            yield look
 
     def _others(self, thread: Thread, stamp: Stamp) -> Neighbours:
         """The strands of the other threads that are held."""
