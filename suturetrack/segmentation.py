@@ -52,6 +52,8 @@ _SLOTS = 4
 _PULL, _ADAPT = 0.1, 0.2
 # What is left at each step of the contrast of a thread that stays lost.
 _FADE = 0.5
+# How far from the middle of a thread its ground begins, in sigmas.
+_GROUND = 2.5
 # Fewest pixels of a curve from which contrast is learned.
 _FEWEST_PIXELS = 8
 # Least automatic c, grey levels: what a flawless picture's rounding makes.
@@ -359,7 +361,8 @@ class _View:
             ridge.mix_channels(*self._channels, weights, self.plane)
 
     def filter(self, plane: Float32, look: _Look, slot: int) -> Float32:
-        """Eq. (1) and Algorithm 1 on the rectified plane, into the slot's buffer."""
+        """Eq. (1) and Algorithm 1 on the rectified plane, into the slot's buffer; rims fade where a
+        thread was learned."""
         out, c = self._outputs[slot], self._config.c or self._c
         if c is None:
             self._find_ridges_by_their_quantile(plane, look, out)
@@ -378,6 +381,8 @@ class _View:
         shape = 0.5 / self._config.beta**2, 0.5 / c**2
         taps = ridge.taps_of(look.sigmas)
         ridge.ridge_field(plane, *taps, shape, look.signs, self._kernel, out, self._strength)
+        if look.relative and look.signs == _SIGNS["dark"]:
+            ridge.fade_rims(plane, _GROUND * max(look.sigmas), out)
 
     def _automatic_c(self) -> float:
         return max(math.sqrt(ridge.quantile(self._strength, 0.998)) / 2, _LEAST_C)

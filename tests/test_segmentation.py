@@ -310,6 +310,49 @@ def test_noise_does_not_make_the_field_flicker(scene: Scene) -> None:
     assert np.std(strengths) < 0.01
 
 
+# --- rims -----------------------------------------------------------------------------------------
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    blur=st.floats(0.8, 3.0),
+    reach=st.floats(2.0, 6.0),
+    level=st.floats(-200.0, 0.0),
+)
+def test_rims_fade_as_in_the_literal_twin(
+    seed: int, blur: float, reach: float, level: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    plane = cv2.GaussianBlur(rng.uniform(0, 255, (48, 64)), (0, 0), blur) + level
+    field = rng.uniform(-0.3, 0.3, (48, 64, 2)).astype(np.float32)
+    plane = plane.astype(np.float32)
+    twin = reference.fade_rims(plane.astype(float), field.astype(float), reach)
+    faded = field.copy()
+    ridge.fade_rims(plane, reach, faded)
+    # Where a place lies halfway between two pixels, rounding may take the other one.
+    assert np.mean(np.abs(faded - twin).max(-1) > 1e-3) < 0.01
+    assert not np.array_equal(faded, field)
+
+
+def test_rims_fade_and_threads_stay() -> None:
+    """A thread alone and two side by side run to a tool that is as dark as they are."""
+    rows = 30.0, 80.0, 84.5
+    beside = np.abs(np.arange(161)[:, None] - rows).min(1)
+    image = np.where((beside < 1.2)[:, None], 40, np.full((161, 161), 150))
+    image[:, 120:] = 40
+    image = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8).astype(np.uint8)
+    frame = StereoFrame(STAMP, image, image)
+    plain, learned = (Segmenter(small_rig(161, 161), SegmentationConfig(c=12.0)) for _ in range(2))
+    learned.learn(frame, Seed(pixel=(40.0, 30.0)))
+    before, after = (np.linalg.norm(s.step(frame).left, axis=-1) for s in (plain, learned))
+    rim = np.s_[45:65, 115:126]
+    assert before[rim].max() > 0.4
+    assert after[rim].max() < 0.05
+    for row in (30, 80, 84):
+        near = np.s_[row - 1 : row + 2, 20:110]
+        np.testing.assert_allclose(after[near], before[near], atol=1e-6)
+
+
 # --- learned contrast -----------------------------------------------------------------------------
 
 

@@ -81,3 +81,29 @@ def gaussian_kernel(sigma):
     offsets = np.arange(-2, 3, dtype=float)
     kernel = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * sigma**2))
     return kernel / kernel.sum()
+
+
+def fade_rims(plane, field, reach, faint=0.1, fades_from=0.55, gone_at=0.85):
+    """The field without ridges of which only one side is brighter."""
+    length = np.linalg.norm(field, axis=-1)
+    u, v = np.moveaxis(field / np.maximum(length, 1e-9)[..., None], -1, 0)
+    row, column = np.indices(length.shape)
+
+    def across(distance):
+        y = np.clip(np.rint(row + distance * u).astype(int), 0, length.shape[0] - 1)
+        x = np.clip(np.rint(column - distance * v).astype(int), 0, length.shape[1] - 1)
+        return plane[y, x]
+
+    middle = np.min([across(k * reach) for k in (-0.5, 0, 0.5)], axis=0)
+    sides = np.array([[across(s * k * reach) for k in (1, 1.5, 2)] for s in (1, -1)]).max(1)
+    sides = np.maximum(sides, middle)
+    depth = sides.sum(0) - 2 * middle
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uneven = np.abs(sides[0] - sides[1]) / depth
+    kept = np.clip((gone_at - uneven) / (gone_at - fades_from), 0, 1)
+    kept[(length < faint) | (depth == 0)] = 1
+    margin = int(np.ceil(2 * reach)) + 1
+    border = np.ones(length.shape, bool)
+    border[margin:-margin, margin:-margin] = False
+    kept[border] = 1
+    return kept[..., None] * field
