@@ -456,12 +456,15 @@ def test_a_thread_along_the_epipolar_lines_is_not_relied_on(rig: StereoRig) -> N
     assert any("uncertain depth" in reason for reason in found.reasons)
 
 
-def test_views_that_disagree_lower_the_confidence(rig: StereoRig, curve: Nurbs) -> None:
+@pytest.mark.parametrize("share", [0.55, 0.85])
+def test_views_that_disagree_lower_the_confidence(
+    rig: StereoRig, curve: Nurbs, share: float
+) -> None:
     left, right = rig.project(dense(curve))
     whole = draw(left, rig), draw(right, rig)
     sure = initialize(field_of(*whole, rig), rig, Seed(pixel=tuple(left[700])))
-    half = draw(right[:1100], rig)
-    unsure = initialize(field_of(whole[0], half, rig), rig, Seed(pixel=tuple(left[700])))
+    part = draw(right[: round(share * len(right))], rig)
+    unsure = initialize(field_of(whole[0], part, rig), rig, Seed(pixel=tuple(left[700])))
     assert unsure.confidence < 0.5 < sure.confidence
     assert any("agree" in reason for reason in unsure.reasons)
 

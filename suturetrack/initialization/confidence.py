@@ -19,6 +19,9 @@ from suturetrack.types import Float64, Nurbs
 Int64 = NDArray[np.int64]
 _AGREED = 0.95
 """Share of the thread from which both views are said to agree."""
+_DISAGREED = 0.5
+"""What is left of the confidence where they do not: of such starts that nothing else made doubtful, seven
+of eight were wrong."""
 _NEAR_PX = 3.0
 _SEEN = 0.1
 """Response from which a crest counts as seen."""
@@ -66,12 +69,14 @@ def judge(
     reasons = []
     pixels = rig.project(nurbs.evaluate(curve, np.linspace(0, 1, 32 * len(curve.control_points))))
     agreement = min(_agreement(p, c.pixels, rig) for p, c in zip(pixels, chains, strict=True))
+    confidence = agreement**2
     if agreement < _AGREED:
         reasons.append(f"left and right view agree about {agreement:.0%} of the thread only")
+        confidence *= _DISAGREED
     seen = float(np.mean([(c.response > _SEEN).mean() for c in samples.crests]))
     if seen < 0.95:
         reasons.append(f"uncertain stretches: {1 - seen:.0%} of the thread is not seen")
-    confidence = agreement**2 * seen
+    confidence *= seen
     vague = float(np.quantile(sigma, 0.25)) / nurbs.length(curve)
     if vague > _VAGUE / 2:
         reasons.append(f"uncertain depth: even its best parts to {vague:.1%} of the length only")
