@@ -599,30 +599,70 @@ def test_an_end_that_runs_along_another_thread_leaves_a_look_in_doubt(rig: Stere
         assert first.beside(strands(other), found).confidence == pytest.approx(left)
 
 
+def overlapping(shared: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two threads that meet, and the first of them as it is mistaken to run on along the second."""
+    x = np.linspace(-25, 25, 600)
+    second = np.c_[x, 0.01 * x**2, np.full(600, 200.0)]
+    meet = second[round((1 - shared) * 600)]
+    first = meet + np.c_[-x - 25, -0.4 * (x + 25), np.zeros(600)][::-1]
+    return first, second, np.r_[first[:-1], second[second[:, 0] >= meet[0]]]
+
+
+def finds(monkeypatch: pytest.MonkeyPatch, **threads: tuple[np.ndarray, float]) -> None:
+    """Looks from the seed of a thread find these points, with such confidence and no doubts."""
+
+    def look(_field: RidgeField, rig: StereoRig, seed: Seed, *_: object) -> Initialization:
+        points, confidence = threads[seed.thread]
+        u, v = rig.project_raw(points[len(points) // 4])[0]
+        alone = initialize(paint(rig, [points], 0), rig, Seed(seed.thread, pixel=(u, v)))
+        return replace(alone, confidence=confidence, doubts=((), ()))
+
+    looks_by(monkeypatch, look)
+
+
 @pytest.mark.parametrize("shared", [0.25, 0.5])
 @pytest.mark.parametrize("names", ["ab", "ba"])
 def test_of_threads_found_in_one_field_the_surest_counts(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch, names: str, shared: float
 ) -> None:
-    x = np.linspace(-25, 25, 600)
-    sure = np.c_[x, 0.01 * x**2, np.full(600, 200.0)]
-    turns_off = sure[round((1 - shared) * 600)]
-    own = turns_off + np.c_[-x - 25, -0.4 * (x + 25), np.zeros(600)][::-1]
-    runs_on = np.r_[own[:-1], sure[sure[:, 0] >= turns_off[0]]]
-    found = {
-        "a": (runs_on, seed_on(rig, own, "a"), 0.6),
-        "b": (sure, Seed("b", pixel=seed_on(rig, sure).pixel), 0.9),
-    }
-
-    def look(_field: RidgeField, _rig: StereoRig, seed: Seed, *_: object) -> Initialization:
-        points, _, confidence = found[seed.thread]
-        alone = initialize(paint(rig, [points], 0), rig, seed)
-        return replace(alone, confidence=confidence, doubts=((), ()))
-
-    looks_by(monkeypatch, look)
+    first, second, runs_on = overlapping(shared)
+    finds(monkeypatch, a=(runs_on, 0.6), b=(second, 0.9))
+    seeds = {"a": seed_on(rig, first, "a"), "b": seed_on(rig, second, "b")}
     tracker = Tracker(rig)
     for name in names:
-        tracker.seed(found[name][1])
-    states = {s.thread: s for s in tracker.step(paint(rig, [own, sure], 0)).states}
+        tracker.seed(seeds[name])
+    states = {s.thread: s for s in tracker.step(paint(rig, [first, second], 0)).states}
     assert states["a"].status is Status.OCCLUDED
     assert states["b"].status is Status.TRACKING
+
+
+@pytest.mark.parametrize("shared", [0.25, 0.5])
+@pytest.mark.parametrize("confidence", [0.6, 0.95])
+def test_of_threads_found_one_after_another_the_surest_counts(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, confidence: float, shared: float
+) -> None:
+    first, second, runs_on = overlapping(shared)
+    finds(monkeypatch, a=(runs_on, confidence), b=(second, 0.9))
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, first, "a"))
+    fields = [paint(rig, [first, second], i) for i in range(DELAY + 4)]
+    assert [s.status for s in tracker.step(fields[0]).states] == [Status.TRACKING]
+    tracker.seed(seed_on(rig, second, "b"))
+    for field in fields[1:]:
+        states = {s.thread: s.status for s in tracker.step(field).states}
+    is_surer = confidence < 0.9
+    assert states["a"] is (Status.OCCLUDED if is_surer else Status.TRACKING)
+    assert states["b"] is (Status.TRACKING if is_surer else Status.OCCLUDED)
+
+
+def test_names_of_one_thread_do_not_doubt_each_other(rig: StereoRig) -> None:
+    points = pair(0)[0]
+    tracker = Tracker(rig)
+    fields = [paint(rig, [points], i) for i in range(DELAY + 4)]
+    for name in "ab":
+        tracker.seed(seed_on(rig, points, name))
+    tracker.step(fields[0])
+    tracker.seed(seed_on(rig, points, "c"))
+    for field in fields[1:]:
+        states = tracker.step(field).states
+    assert [state.status for state in states] == [Status.TRACKING] * 3

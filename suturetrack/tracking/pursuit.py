@@ -52,7 +52,8 @@ class Pursuit:
 
     def lies_on(self, others: Neighbours) -> bool:
         """Whether what is followed now is one of the other threads."""
-        return lies_on(self.follower.model.curve, others, self.follower.rig)
+        surer = others.as_sure_as(self.found.confidence)
+        return lies_on(self.follower.model.curve, surer, self.follower.rig)
 
     def _is_fresh(self, field: RidgeField) -> bool:
         return (

@@ -28,7 +28,7 @@ _PLACES = 24
 _SEEDS = 2
 # Threads that lie on one another do so for less of their length.
 _SHARED = 0.3
-# And what is the same thread, found once more, for almost all of it.
+# And one thread under two names does for almost all of it.
 _SAME = 0.9
 _EVENLY = np.linspace(0, 1, 4 * _PLACES)
 # How near and for how long an end may run along another thread, and what more leaves of the confidence.
@@ -106,15 +106,17 @@ def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
     return bool(np.mean(_shared(curve, others, rig, search.APART_PX)) > _SHARED)
 
 
-def is_one_of(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
-    """Whether almost all of the curve lies on the strands of other threads, in both images."""
-    return bool(np.mean(_shared(curve, others, rig, _BESIDE_PX)) > _SAME)
-
-
 def doubting_ends(found: Initialization, others: Neighbours, rig: StereoRig) -> Initialization:
-    """The look, which is not sure by itself where an end runs on along another thread."""
-    shared = _shared(found.curve, others, rig, _BESIDE_PX)
+    """The look, which is not sure by itself where an end runs on along another thread that is as sure.
+
+    What lies on others from end to end is one of them under another name.
+    """
+    shared = _shared(found.curve, others.as_sure_as(found.confidence), rig, _BESIDE_PX)
+    if shared.mean() > _SAME:
+        return found
     spacing = polyline_length(rig.project(evaluate(found.curve, _EVENLY))[0]) / len(_EVENLY)
+    # The tips themselves are a little apart.
+    shared[[0, -1]] |= shared[[1, -2]]
     runs = [np.argmin(np.r_[flags, False]) for flags in (shared, shared[::-1])]
     new = tuple(
         (abs(end - float(_EVENLY[run])), _DOUBTED)

@@ -14,7 +14,6 @@ from suturetrack.tracking.recovery import (
     directed,
     doubting_ends,
     find_again,
-    is_one_of,
     lies_on,
     starts_on,
 )
@@ -44,8 +43,7 @@ class FromSeed:
 
     def beside(self, others: Neighbours, found: Initialization) -> Found:
         """What was found, which may be one of the other threads."""
-        rig = self.setup.rig.with_row_offset(found.row_offset_px)
-        return found if is_one_of(found.curve, others, rig) else doubting_ends(found, others, rig)
+        return doubting_ends(found, others, self.setup.rig.with_row_offset(found.row_offset_px))
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows the first curve."""
@@ -121,7 +119,8 @@ class Closer:
 
 
 def _none_of(others: Neighbours, found: Initialization, rig: StereoRig) -> Initialization | None:
-    return None if lies_on(found.curve, others, rig) else doubting_ends(found, others, rig)
+    surer = others.as_sure_as(found.confidence)
+    return None if lies_on(found.curve, surer, rig) else doubting_ends(found, others, rig)
 
 
 Search = FromSeed | Again | Closer

@@ -70,6 +70,15 @@ class Neighbours:
 
     threads: tuple[tuple[Strand, Strand], ...] = ()
     """One by one, in the left and in the right image."""
+    confidences: tuple[float, ...] = ()
+    """How sure it is of each that it is one; without them, of all."""
+
+    def as_sure_as(self, confidence: float) -> Neighbours:
+        """Those of which it is at least as sure."""
+        if not self.confidences:
+            return self
+        both = zip(self.threads, self.confidences, strict=True)
+        return Neighbours(tuple(thread for thread, sure in both if sure >= confidence))
 
     @cached_property
     def both(self) -> tuple[Strand, Strand]:

@@ -68,6 +68,8 @@ class Sureness:
         before: Sureness | None = None,
     ) -> None:
         self._rig, self._votes = rig, _votes(found.confidence)
+        self.confidence = found.confidence
+        """The best of a look that found what is followed."""
         self._accused: Float64 | None = None if before is None else before._accused
         self.is_sure = found.confidence >= SURE and not self._is_accused(curve)
         """Whether the curve that is followed may be called the thread."""
@@ -109,7 +111,7 @@ class Sureness:
         if agrees and self._is_accused(followed):
             return False
         if confidence >= SURE and (agrees or apart < _OTHER_PX):
-            self.is_sure = True
+            self.is_sure, self.confidence = True, max(self.confidence, confidence)
             return apart >= _SAME_PX
         if confidence < SURE and not self._has_bent(followed):
             return False
@@ -120,7 +122,7 @@ class Sureness:
         self.is_sure = -self._votes >= _PLENTY
         self._votes, self._shape = abs(self._votes), places[0 if is_outvoted else 1]
         if is_outvoted:
-            self._doubts = None
+            self._doubts, self.confidence = None, confidence
             self._settle(found)
         elif agrees:
             left = self._settle(found)

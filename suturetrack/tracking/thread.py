@@ -14,7 +14,7 @@ from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.length import has_length
 from suturetrack.tracking.looks import Look, Outcome
 from suturetrack.tracking.pursuit import Pursuit
-from suturetrack.tracking.recovery import Setup
+from suturetrack.tracking.recovery import Setup, doubting_ends
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.tracking.searches import Again, Closer, FromSeed, Search, lengths
 from suturetrack.tracking.strands import Neighbours
@@ -82,6 +82,11 @@ class Thread:
     def follower(self) -> Follower | None:
         """Who follows the thread, once it has been found."""
         return None if self._pursuit is None else self._pursuit.follower
+
+    @property
+    def confidence(self) -> float:
+        """The best of a look at the curve that is followed; 0 without one."""
+        return 0.0 if self._sureness is None else self._sureness.confidence
 
     @property
     def direction(self) -> Nurbs | None:
@@ -218,6 +223,18 @@ class Thread:
             self._take_again(outcome, search.known_lengths)
         else:
             self._take_closer(search, outcome)
+
+    def doubt_beside(self, others: Neighbours, now_ns: int) -> None:
+        """Calls a curve open, and its length unknown, whose end runs on along threads that are surer."""
+        if self._pursuit is None or self._sureness is None or not self._sureness.is_sure:
+            return
+        curve, rig = self._pursuit.follower.model.curve, self._pursuit.follower.rig
+        found = replace(self._pursuit.found, curve=curve, confidence=self.confidence)
+        doubted = doubting_ends(found, others, rig)
+        if doubted.confidence < SURE:
+            self._sureness = Sureness(doubted, curve, now_ns, rig)
+            self._was_sure, self._known = False, None
+            self._come_to(self._followed)
 
     def _take_first(self, outcome: Outcome, fields: int) -> None:
         if isinstance(outcome.found, InitializationError):

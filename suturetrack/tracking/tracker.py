@@ -135,7 +135,7 @@ class Tracker:
         look.add(self._worker, field.of(look.thread), others)
         if field.stamp.capture_ns >= look.due_ns:
             self._look = None
-            thread.take_up(look, others)
+            self._take_up(look, others)
             yield look
 
     def _begin_to_look(self, field: RidgeField, held: set[str]) -> Iterator[Look]:
@@ -162,17 +162,26 @@ class Tracker:
         for _, thread, look in sorted(at_once, key=lambda found: -found[0]):
             others = self._others(thread, field.stamp)
             look.follow(others)
-            thread.take_up(look, others)
+            self._take_up(look, others)
             yield look
+
+    def _take_up(self, look: Look, others: Neighbours) -> None:
+        """Takes up what a look found; whoever is less sure and runs along it comes to be doubted."""
+        stamp = look.field.stamp
+        self._threads[look.thread].take_up(look, others)
+        for other in self._threads.values():
+            if other.name != look.thread and other.is_held:
+                other.doubt_beside(self._others(other, stamp), stamp.capture_ns)
 
     def _others(self, thread: Thread, stamp: Stamp) -> Neighbours:
         """The strands of the other threads that are held."""
         held = [
-            other.follower
+            (other.follower.strands(stamp.capture_ns), other.confidence)
             for other in self._threads.values()
             if other is not thread and other.follower is not None and other.is_held
         ]
-        return Neighbours(tuple(follower.strands(stamp.capture_ns) for follower in held))
+        strands, confidences = zip(*held, strict=True) if held else ((), ())
+        return Neighbours(strands, confidences)
 
     def _drop_look(self, thread: str) -> None:
         if self._look is not None and self._look.thread == thread:
