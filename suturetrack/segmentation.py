@@ -205,7 +205,8 @@ class Segmenter:
     def warm_up(self) -> None:
         """Compile (or load) the kernels, so that the first frame is as quick as the next."""
         width, height = self._rig.image_size
-        sight = _Sight(self._rig, self._config, self._first.look)
+        # Learned, so that rims fade as well.
+        sight = _Sight(self._rig, self._config, replace(self._first.look, relative=True))
         for shape in ((height, width, 3), (height, width)):
             black = np.zeros(shape, np.uint8)
             field = sight.step(StereoFrame(Stamp(0, 0, 0), black, black), 0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tracemalloc
 
 import cv2
@@ -238,6 +240,34 @@ def test_no_image_is_allocated_once_warm(rectified: bool, distorted_rig: StereoR
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 640 * 480 / 4
+
+
+_WARMS_UP = """
+from suturetrack.kernels import ridge
+from suturetrack.segmentation import Segmenter
+from suturetrack.stage import open_scene
+from suturetrack.types import Seed, Stamp, StereoFrame
+
+def compiled():
+    return {name: k.signatures for name, k in vars(ridge).items() if hasattr(k, "signatures")}
+
+scene = open_scene("two-threads", 3)
+segmenter = Segmenter(scene.rig)
+segmenter.warm_up()
+before = {name: list(signatures) for name, signatures in compiled().items()}
+frame = StereoFrame(Stamp(0, 0, 0), *scene.render(0))
+segmenter.step(frame)
+for name in scene.threads:
+    segmenter.learn(frame, Seed(name, pixel=scene.seed_pixel(0, name)))
+segmenter.step(frame)
+assert segmenter.threads == scene.threads
+print({name: k for name, k in compiled().items() if k != before[name]})
+"""
+
+
+def test_nothing_is_compiled_in_the_midst_of_a_run() -> None:
+    ran = subprocess.run([sys.executable, "-c", _WARMS_UP], capture_output=True, text=True)
+    assert ran.stdout == "{}\n", ran.stdout + ran.stderr
 
 
 def test_a_field_lives_for_three_more_steps() -> None:
