@@ -232,7 +232,7 @@ class Thread:
         found = replace(self._pursuit.found, curve=curve, confidence=self.confidence)
         doubted = doubting_ends(found, others, rig)
         if doubted.confidence < SURE:
-            self._sureness = Sureness(doubted, curve, now_ns, rig)
+            self._sureness = Sureness(doubted, curve, now_ns, rig, self._sureness)
             self._was_sure, self._known = False, None
             self._come_to(self._followed)
 

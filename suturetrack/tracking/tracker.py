@@ -135,7 +135,7 @@ class Tracker:
         look.add(self._worker, field.of(look.thread), others)
         if field.stamp.capture_ns >= look.due_ns:
             self._look = None
-            self._take_up(look, others)
+            self._take_up(look, others, field.stamp)
             yield look
 
     def _begin_to_look(self, field: RidgeField, held: set[str]) -> Iterator[Look]:
@@ -162,12 +162,11 @@ class Tracker:
         for _, thread, look in sorted(at_once, key=lambda found: -found[0]):
             others = self._others(thread, field.stamp)
             look.follow(others)
-            self._take_up(look, others)
+            self._take_up(look, others, field.stamp)
             yield look
 
-    def _take_up(self, look: Look, others: Neighbours) -> None:
+    def _take_up(self, look: Look, others: Neighbours, stamp: Stamp) -> None:
         """Takes up what a look found; whoever is less sure and runs along it comes to be doubted."""
-        stamp = look.field.stamp
         self._threads[look.thread].take_up(look, others)
         for other in self._threads.values():
             if other.name != look.thread and other.is_held:
