@@ -456,6 +456,28 @@ def test_a_thread_along_the_epipolar_lines_is_not_relied_on(rig: StereoRig) -> N
     assert any("uncertain depth" in reason for reason in found.reasons)
 
 
+def test_an_end_along_an_epipolar_line_keeps_its_depth_on_few_knots() -> None:
+    """As the first end of thread 1 in this scene."""
+    scene = open_scene("two-threads", 940)
+    frame, segmenter = StereoFrame(STAMP, *scene.render(0)), Segmenter(scene.rig)
+    seeds = [Seed(name, pixel=scene.seed_pixel(0, name)) for name in scene.threads]
+    for seed in seeds:
+        segmenter.learn(frame, seed)
+    found = initialize(segmenter.step(frame).of("1"), scene.rig, seeds[1])
+    truth = scene.truth(0)[1].points
+    assert curve_error(dense(found.curve), truth).rms * 1000 * scene.rig.metres_per_unit < 0.2
+
+
+def test_a_straight_thread_that_crosses_the_epipolar_lines_is_relied_on() -> None:
+    """At 12 degrees, before cameras as close together as an endoscope's."""
+    scene = open_scene("pull-through", 229, "endoscope")
+    field, seed = field_and_seed(scene)
+    found = initialize(field, scene.rig, seed)
+    truth = scene.truth(0)[0].points
+    assert curve_error(dense(found.curve), truth).rms * 1000 * scene.rig.metres_per_unit < 0.3
+    assert found.confidence > 0.5
+
+
 @pytest.mark.parametrize("share", [0.55, 0.85])
 def test_views_that_disagree_lower_the_confidence(
     rig: StereoRig, curve: Nurbs, share: float

@@ -143,3 +143,15 @@ def test_what_moves_across_the_curve_is_no_stranger(rig: StereoRig) -> None:
     across = [np.c_[20 * T, 6 * T + i / 2, np.full(400, 200.0)] for i in range(20)]
     shown = [paint(rig, [line(), other], 3 * i) for i, other in enumerate(across)]
     assert not any(found(rig, [line()] * len(shown), shown))
+
+
+@pytest.mark.parametrize(("radius", "is_stranger"), [(3.0, False), (8.0, True)])
+def test_the_loop_of_a_tight_knot_is_no_stranger_but_a_wide_one_is(
+    rig: StereoRig, radius: float, is_stranger: bool
+) -> None:
+    """A curve passes a tight knot as a point; the knot slides along the line."""
+    turn = np.linspace(0, 2 * np.pi, 200)
+    loop = np.c_[radius * (1 - np.cos(turn)), radius * np.sin(turn), np.full(200, 200.0)]
+    loops = [loop + np.array([0, i / 2, 0]) for i in range(20)]
+    shown = [paint(rig, [line(), loop], 3 * i) for i, loop in enumerate(loops)]
+    assert any(found(rig, [line()] * len(shown), shown)) == is_stranger

@@ -28,13 +28,13 @@ with it, and neighbouring samples err alike."""
 _EVIDENCE_STEPS = 3
 _STAY = 0.01
 """Weight, against that of a crest, which keeps samples from sliding along the thread."""
+_STAY_DEEP = 0.003
+"""And one which keeps their disparity where the crests do not tell it."""
 _UNSEEN = 0.02
 """Trust in a crest below which a view does not see the thread."""
 _STIFFEST = 1e9
 _RIDGE = 1e-9
 _END_NOISE_PX = 0.2
-_ROW_NOISE_PX = 0.1
-"""By how much the rows of two calibrated views are off, px."""
 _OFF_PX = 0.2
 """By how much the rows of two views have to be off, at least, for that to be told from the bunching of
 depth along the epipolar lines: calibrated ones seem to be off by up to 0.05."""
@@ -196,8 +196,7 @@ class _Fit:
 
 
 def deviations(curve: Nurbs, samples: Samples, stiffness: Float64) -> Float64:
-    """(k,) standard deviations of the samples in space: by the noise of the crests, and by rows of
-    the two views that are not quite those of the calibration."""
+    """(k,) standard deviations of the samples in space, by the noise of the crests."""
     noise = max(samples.noise_px, _LEAST_NOISE_PX) ** 2
     data, pull = _crest_equations(curve, samples)
     _add_ends(data, pull, samples, noise)
@@ -207,18 +206,18 @@ def deviations(curve: Nurbs, samples: Samples, stiffness: Float64) -> Float64:
         raise FloatingPointError("the curve is not held by the images")
     first, table = spline.local_basis(samples.s, curve.knots)
     covariance = spline.sample_covariance(first, table[0], spline.band_of_inverse(factor))
-    mixed, _, _ = _slip_equations(curve, samples)
-    step = _ROW_NOISE_PX * spline.solve_factorized(factor, mixed / noise)
-    moved = spline.combine(first, table[0], step.reshape(-1, 3))
-    return np.sqrt(np.trace(covariance, axis1=1, axis2=2) + (moved**2).sum(1))
+    return np.sqrt(np.trace(covariance, axis1=1, axis2=2))
 
 
 def with_needed_knots(samples: Samples) -> Nurbs:
     """A curve through the samples with as few knots as the crests allow.
 
     Spans are halved, by misfit, until none fits the crests significantly worse than the samples do.
+    An end along an epipolar line has the depth of the samples: the crests say nothing of it.
     """
-    information = sum(_information(samples), start=_stay(samples))
+    disparity = _image_axes(samples)[:, 2:]
+    held = _stay(samples) + _STAY_DEEP * np.einsum("kij,kil->kjl", disparity, disparity)
+    information = sum(_information(samples), start=held)
     noise = max(samples.noise_px, _LEAST_NOISE_PX) ** 2
     interior = np.array([0.5])
     while True:

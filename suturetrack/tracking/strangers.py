@@ -26,8 +26,9 @@ _WIDEST_PX = 24
 # What is nearer than this to the rim of the thread may be its own; a branch begins and goes further
 # away than that.
 _OWN_PX, _TOUCHES_PX, _LEAVES_PX = 2.0, 5.0, 6.0
-# Length of a branch, and its distance from the ends, in distances of what may be the thread's own.
-_LONG, _FROM_ENDS = 5.0, 5.0
+# Length of a branch, and its distance from the ends, in distances of what may be the thread's own. The
+# loop of a tight knot, which the curve passes as a point, is shorter.
+_LONG, _FROM_ENDS = 8.0, 5.0
 # How far around the curve is looked, in the same.
 _MARGIN = 12.0
 # Branches that begin within so many such distances of one another are the same one in both views, and
