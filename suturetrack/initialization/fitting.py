@@ -28,8 +28,8 @@ with it, and neighbouring samples err alike."""
 _EVIDENCE_STEPS = 3
 _STAY = 0.01
 """Weight, against that of a crest, which keeps samples from sliding along the thread."""
-_STAY_DEEP = 0.003
-"""And one which keeps their disparity where the crests do not tell it."""
+_STAY_DEEP = 3e-5
+"""And one, of no weight where the crests tell, which keeps their disparity where they do not."""
 _UNSEEN = 0.02
 """Trust in a crest below which a view does not see the thread."""
 _STIFFEST = 1e9
