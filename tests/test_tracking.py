@@ -232,18 +232,27 @@ def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:
         assert abs(found.length_percent) < 1.0
 
 
+@pytest.mark.parametrize("start_s", [0.0, 0.4, 1.5, 3.0])
 def test_what_hides_much_of_the_middle_does_not_lose_a_thread_that_is_shaken(
-    rig: StereoRig,
+    rig: StereoRig, start_s: float
 ) -> None:
-    """What is held on both sides cannot be far."""
+    """What is held on both sides cannot be far, however the thread bends where nobody sees it."""
     truths = [
-        thread(i / FPS) + 0.5 * np.array([np.sin(1.1 * i), np.cos(1.7 * i), 0.0]) for i in range(60)
+        thread(start_s + i / FPS) + 0.5 * np.array([np.sin(1.1 * i), np.cos(1.7 * i), 0.0])
+        for i in range(60)
     ]
     states = follow(with_hidden_middle(rig, truths, 30.0), rig, seed_on(rig, truths[0]))
+    assert Status.LOST not in [state.status for state in states]
+    seen_rms = []
     for state, truth in list(zip(states, truths, strict=True))[10:]:
-        assert state.status is Status.TRACKING
+        assert state.curve is not None
+        samples = nurbs.evaluate(state.curve, np.linspace(0, 1, len(state.seen)))
+        off = np.linalg.norm(metrics.polyline_offsets(samples, truth), axis=1)
+        seen_rms.append(np.sqrt((off[state.seen] ** 2).mean()))
         assert 0.1 < 1 - state.seen.mean() < 0.25
-        assert error(state, truth).rms < 0.5
+        assert off.max() < 5.0
+    assert np.median(seen_rms) < 0.2
+    assert max(seen_rms) < 0.7
 
 
 def test_a_hidden_end_is_held_and_taken_up_again(rig: StereoRig) -> None:
