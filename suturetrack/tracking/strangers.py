@@ -26,9 +26,9 @@ _WIDEST_PX = 24
 # What is nearer than this to the rim of the thread may be its own; a branch begins and goes further
 # away than that.
 _OWN_PX, _TOUCHES_PX, _LEAVES_PX = 2.0, 5.0, 6.0
-# Length of a branch, and its distance from the ends, in distances of what may be the thread's own. The
-# loop of a tight knot, which the curve passes as a point, is shorter.
-_LONG, _FROM_ENDS = 8.0, 5.0
+# Length of a branch, and its distance from the ends, in distances of what may be the thread's own; and that
+# of a knot's loop, which leads half as far away from a curve that passes it as a point.
+_LONG, _FROM_ENDS, _KNOT = 5.0, 5.0, 8.0
 # How far around the curve is looked, in the same.
 _MARGIN = 12.0
 # Branches that begin within so many such distances of one another are the same one in both views, and
@@ -153,7 +153,9 @@ def _branches(
         is_left = np.sum(there[beside, places] * view.normals[places], axis=1) > 0
         touched[is_left.astype(int), places] = True
         new = np.argwhere(piece & (stayed[box] == 0))
-        if len(new) and np.linalg.norm(np.ptp(new, axis=0)) > _LONG * own_px:
+        length = np.linalg.norm(np.ptp(new, axis=0)) if len(new) else 0.0
+        is_knot = length < min(_KNOT * own_px, 2 * away[box][piece].max())
+        if length > _LONG * own_px and not is_knot:
             moved[is_left.astype(int), places] = True
     spacing = max(polyline_length(view.pixels), 1.0) / (shape[1] - 1)
     same, across = (round(times * own_px / spacing) for times in (_SAME, _ACROSS))
