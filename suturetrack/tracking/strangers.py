@@ -154,7 +154,7 @@ def _branches(
         touched[is_left.astype(int), places] = True
         new = np.argwhere(piece & (stayed[box] == 0))
         length = np.linalg.norm(np.ptp(new, axis=0)) if len(new) else 0.0
-        is_knot = length < min(_KNOT * own_px, 2 * away[box][piece].max())
+        is_knot = length < _KNOT * own_px and length / 2 < away[box][piece].max()
         if length > _LONG * own_px and not is_knot:
             moved[is_left.astype(int), places] = True
     spacing = max(polyline_length(view.pixels), 1.0) / (shape[1] - 1)
