@@ -232,15 +232,19 @@ def test_what_hides_the_middle_is_marked_and_bridged(rig: StereoRig) -> None:
         assert abs(found.length_percent) < 1.0
 
 
+def shaken(start_s: float) -> list[np.ndarray]:
+    return [
+        thread(start_s + i / FPS) + 0.5 * np.array([np.sin(1.1 * i), np.cos(1.7 * i), 0.0])
+        for i in range(60)
+    ]
+
+
 @pytest.mark.parametrize("start_s", [0.0, 0.4, 1.5, 3.0])
 def test_what_hides_much_of_the_middle_does_not_lose_a_thread_that_is_shaken(
     rig: StereoRig, start_s: float
 ) -> None:
     """What is held on both sides cannot be far, however the thread bends where nobody sees it."""
-    truths = [
-        thread(start_s + i / FPS) + 0.5 * np.array([np.sin(1.1 * i), np.cos(1.7 * i), 0.0])
-        for i in range(60)
-    ]
+    truths = shaken(start_s)
     states = follow(with_hidden_middle(rig, truths, 30.0), rig, seed_on(rig, truths[0]))
     assert Status.LOST not in [state.status for state in states]
     seen_rms = []
@@ -253,6 +257,17 @@ def test_what_hides_much_of_the_middle_does_not_lose_a_thread_that_is_shaken(
         assert off.max() < 5.0
     assert np.median(seen_rms) < 0.2
     assert max(seen_rms) < 0.7
+
+
+@pytest.mark.parametrize("start_s", [2.2, 3.0])
+def test_a_shaken_thread_that_bends_little_where_it_is_hidden_is_tracked(
+    rig: StereoRig, start_s: float
+) -> None:
+    truths = shaken(start_s)
+    states = follow(with_hidden_middle(rig, truths, 30.0), rig, seed_on(rig, truths[0]))
+    for state, truth in list(zip(states, truths, strict=True))[10:]:
+        assert state.status is Status.TRACKING
+        assert error(state, truth).rms < 0.5
 
 
 def test_a_hidden_end_is_held_and_taken_up_again(rig: StereoRig) -> None:
