@@ -195,6 +195,23 @@ def test_a_stretch_keeps_its_depth_while_it_runs_along_an_epipolar_line(
     assert max(off) < 0.65
 
 
+def test_a_straight_thread_is_not_called_tracking_while_no_depth_of_it_is_told(
+    rig: StereoRig,
+) -> None:
+    degrees = np.r_[np.linspace(40, 0.5, 50), np.linspace(0.5, 20, 25)]
+    angle, x = np.radians(degrees), np.linspace(-25, 25, 600)
+    truths = [np.c_[x * np.cos(a), x * np.sin(a), np.full(600, 200.0)] for a in angle]
+    fields = [paint(rig, [points], i, noise=0.05) for i, points in enumerate(truths)]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    for state, turned in zip(states, degrees, strict=True):
+        assert state.curve is not None
+        assert (state.sigma**2).mean() ** 0.5 < 0.04 * state.length
+        if turned > 5:
+            assert state.status is Status.TRACKING
+        elif turned < 1:
+            assert state.status is Status.OCCLUDED
+
+
 def test_an_end_that_is_hidden_for_a_moment_makes_the_thread_no_shorter(rig: StereoRig) -> None:
     whole = thread(0.0)
     hidden = range(30, 36)

@@ -48,6 +48,8 @@ _ALL = 0.97
 # Share that has to run alone, so that the others, which other ridges draw aside, hardly make it longer.
 _CLEAR = 0.94
 _SURE_AFTER_S = 0.08
+# Standard deviation, against its length, from which on the images do not tell where a curve runs.
+_VAGUE = 0.0225
 # How long a doubtful end is held before it is cut off.
 _PATIENCE_S = 0.06
 _SOME = 0.2
@@ -217,6 +219,7 @@ class Follower:
         is_vague = self._doubt.gone.mean() > ASTRAY
         is_vague |= any(self._hidden.for_longer_than(_HIDDEN_S))
         is_vague |= bool(self._leaps.any()) and not known.is_reached(length)
+        is_vague |= bool(np.sqrt(np.mean(evidence.sigma**2)) > _VAGUE * length)
         makes_detour = not is_clear and known.is_exceeded(length, noise)
         if status is Status.TRACKING and (is_vague or makes_detour):
             return Status.OCCLUDED
