@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,8 +26,9 @@ from suturetrack.tracking.recovery import Setup, directed, doubting_ends
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.searches import FromSeed
 from suturetrack.tracking.strands import Neighbours, Strand
+from suturetrack.tracking.strangers import Strangers
 from suturetrack.tracking.sureness import Sureness
-from suturetrack.types import RidgeField, Seed, Status, ThreadState
+from suturetrack.types import Bool, Nurbs, RidgeField, Seed, Status, ThreadState
 from tests.painting import FPS, paint, thread
 
 Look = Callable[..., Initialization]
@@ -505,6 +507,89 @@ def test_a_curve_that_was_revoked_is_sure_again_once_it_has_moved(rig: StereoRig
     assert sureness.is_sure
 
 
+@pytest.mark.parametrize(("confidence", "at_once"), [(0.6, False), (0.8, True)])
+def test_a_first_look_that_is_not_plain_needs_a_second_one(
+    rig: StereoRig, confidence: float, at_once: bool
+) -> None:
+    look = look_at(rig, thread(0.0), confidence)
+    sureness = Sureness(look, look.curve, 0, rig)
+    assert sureness.is_sure == at_once
+    assert not sureness.weigh(look, look.curve)
+    assert sureness.is_sure
+
+
+@pytest.mark.parametrize("is_accused", [False, True])
+def test_what_runs_beside_a_revoked_curve_takes_its_place(rig: StereoRig, is_accused: bool) -> None:
+    first = look_at(rig, thread(0.0), 0.9 if is_accused else 0.1)
+    sureness = Sureness(first, first.curve, 0, rig)
+    sureness.revoke(first.curve, 1)
+    followed = look_at(rig, thread(0.6), 0.0).curve
+    beside = look_at(rig, thread(0.6) + np.array([0.0, 2.0, 0.0]), 0.4)
+    assert sureness.weigh(beside, followed) == is_accused
+    assert not sureness.is_sure
+
+
+def test_a_revoked_curve_does_not_tell_the_length(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was another thread: what later looks find for sure has its own length."""
+
+    def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
+        seed = seed_on(rig, pair(field.stamp.frame)[min(field.stamp.frame, 1)])
+        return replace(initialize(field, rig, seed), confidence=0.9)
+
+    step, revoked_at = Strangers.step, 10
+
+    def accuse(
+        self: Strangers, curve: Nurbs, seen: Bool, field: RidgeField, *args: Any
+    ) -> Strangers:
+        strangers = step(self, curve, seen, field, *args)
+        return replace(strangers, is_found=field.stamp.frame == revoked_at)
+
+    looks_by(monkeypatch, look)
+    monkeypatch.setattr(Strangers, "step", accuse)
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, pair(0)[0]))
+    fields = fields_of(rig, 3 * FPS, range(0))
+    states = [tracker.step(field).states[0] for field in fields]
+    lengths = [metrics.polyline_length(points) for points in pair(0)]
+    assert abs(lengths[0] - lengths[1]) > 0.1 * lengths[0]
+    assert states[revoked_at - 1].status is Status.TRACKING
+    assert rms(states[revoked_at - 1], pair(revoked_at - 1)[0]) < 0.2
+    assert states[revoked_at].status is Status.OCCLUDED
+    assert states[-1].status is Status.TRACKING
+    assert rms(states[-1], pair(len(fields) - 1)[1]) < 0.2
+
+
+def lens(height: float) -> np.ndarray:
+    """A thread that bulges in its middle, where another one crosses it twice."""
+    x = np.linspace(-30, 30, 600)
+    bulge = np.where(abs(x) < 9, np.cos(np.pi * x / 18) ** 2, 0.0)
+    return np.c_[x, 0.01 * x**2 + height * bulge, np.full(600, 200.0)]
+
+
+@pytest.mark.parametrize(("confidence", "is_put_right"), [(0.4, True), (0.1, False)])
+def test_a_curve_that_another_ridge_has_drawn_aside_is_put_right_by_a_look(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, confidence: float, is_put_right: bool
+) -> None:
+    truth, other = lens(1.2), lens(-0.2)
+
+    def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
+        points = truth if field.stamp.frame else other
+        found = initialize(paint(rig, [points], 0), rig, seed_on(rig, points))
+        return replace(found, confidence=confidence if field.stamp.frame else 0.9)
+
+    looks_by(monkeypatch, look)
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, truth))
+    fields = [paint(rig, [truth, other], i) for i in range(FPS)]
+    states = [tracker.step(field).states[0] for field in fields]
+    assert all(state.status is Status.TRACKING for state in states)
+    assert any("put right" in state.events for state in states) == is_put_right
+    assert rms(states[0], other) < 0.1
+    assert rms(states[-1], truth if is_put_right else other) < 0.15
+
+
 def test_doubts_run_with_the_curve(rig: StereoRig) -> None:
     found = initialize(paint(rig, [thread(0.0)], 0), rig, seed_on(rig, thread(0.0)))
     found = replace(found, doubts=(((0.2, 0.5),), ()))
@@ -626,7 +711,7 @@ def test_of_threads_found_in_one_field_the_surest_counts(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch, names: str, shared: float
 ) -> None:
     first, second, runs_on = overlapping(shared)
-    finds(monkeypatch, a=(runs_on, 0.6), b=(second, 0.9))
+    finds(monkeypatch, a=(runs_on, 0.8), b=(second, 0.9))
     seeds = {"a": seed_on(rig, first, "a"), "b": seed_on(rig, second, "b")}
     tracker = Tracker(rig)
     for name in names:
@@ -637,7 +722,7 @@ def test_of_threads_found_in_one_field_the_surest_counts(
 
 
 @pytest.mark.parametrize("shared", [0.25, 0.5])
-@pytest.mark.parametrize("confidence", [0.6, 0.95])
+@pytest.mark.parametrize("confidence", [0.8, 0.95])
 def test_of_threads_found_one_after_another_the_surest_counts(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch, confidence: float, shared: float
 ) -> None:

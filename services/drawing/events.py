@@ -21,7 +21,7 @@ MARKS = {
     "removed": (YELLOW, MarkerShape.Square),
 }
 """The kinds of events and what marks them, the one that matters most first."""
-_FOUND = ("found", "found again", "found elsewhere", "found for sure", "recovered")
+_FOUND = ("found", "found again", "found elsewhere", "found for sure", "put right", "recovered")
 _CONTROL_POINTS = re.compile(r"control points: (\d+) inserted, (\d+) removed")
 
 

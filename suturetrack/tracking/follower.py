@@ -95,6 +95,8 @@ class Follower:
         self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
         self._share = 1.0
+        self.is_crowded = self.makes_detour = False
+        """Whether other ridges run beside the thread, and whether they have made the curve too long."""
         self._comes_in = False
         """Whether the thread has been coming into the images since it was cut by their border."""
         self._leaps: Bool = np.zeros(2, bool)
@@ -213,6 +215,8 @@ class Follower:
         length, is_clear = length_of(model.curve), _is_clear(plain, evidence)
         last = length_of(self.last_good)
         is_another = known.is_another(length, last, noise, is_clear=is_clear)
+        self.is_crowded = bool((plain & evidence.alone).mean() <= _ALL)
+        self.makes_detour = self.is_crowded and known.is_exceeded(length, noise)
         if self._lost and (is_another or plain.mean() < 1 - ASTRAY):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
@@ -220,8 +224,7 @@ class Follower:
         is_vague |= any(self._hidden.for_longer_than(_HIDDEN_S))
         is_vague |= bool(self._leaps.any()) and not known.is_reached(length)
         is_vague |= bool(np.sqrt(np.mean(evidence.sigma**2)) > _VAGUE * length)
-        makes_detour = not is_clear and known.is_exceeded(length, noise)
-        if status is Status.TRACKING and (is_vague or makes_detour):
+        if status is Status.TRACKING and (is_vague or self.makes_detour):
             return Status.OCCLUDED
         return status
 

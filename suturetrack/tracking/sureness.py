@@ -17,6 +17,8 @@ SURE = 0.5
 _ENOUGH = 1.5
 # And those that the look by which another curve was voted down has to have more.
 _PLENTY = 3.0
+# Confidence of the first look that needs no second one.
+_AT_ONCE = 0.75
 # Votes below which it is not worth looking from.
 _HOPELESS = 0.01
 # What the doubts that no look has settled leave of a curve that is sure, and how far apart two doubts
@@ -71,7 +73,8 @@ class Sureness:
         self.confidence = found.confidence
         """The best of a look that found what is followed."""
         self._accused: Float64 | None = None if before is None else before._accused
-        self.is_sure = found.confidence >= SURE and not self._is_accused(curve)
+        enough = _AT_ONCE if before is None else SURE
+        self.is_sure = found.confidence >= enough and not self._is_accused(curve)
         """Whether the curve that is followed may be called the thread."""
         self._evidence, self._length = 0.0, 0.0
         self._doubts: PlacedDoubts | None = None
@@ -106,7 +109,7 @@ class Sureness:
         """Adds a look; whether what it found, in the direction of what is followed, takes its place."""
         confidence = found.confidence
         places = self._outline(found.curve), self._outline(followed)
-        apart = float(np.linalg.norm(places[0] - places[1], axis=2).max())
+        apart = self._away(found.curve, followed)
         agrees = apart < _SAME_PX or self.is_same(found.curve, followed)
         if agrees and self._is_accused(followed):
             return False
@@ -115,7 +118,8 @@ class Sureness:
             return apart >= _SAME_PX
         if confidence < SURE and not self._has_bent(followed):
             return False
-        if not agrees and apart < _OTHER_PX:
+        is_open = self._accused is None or self.is_sure
+        if not agrees and apart < _OTHER_PX and is_open:
             return False
         self._votes += _votes(confidence) if agrees else -_votes(confidence)
         is_outvoted = self._votes < 0
@@ -128,6 +132,12 @@ class Sureness:
             left = self._settle(found)
             self.is_sure = max(self._evidence, self._votes >= _ENOUGH) * left >= _TOGETHER
         return is_outvoted
+
+    def outweighs(self, confidence: float, found: Nurbs, followed: Nurbs, *, likely: float) -> bool:
+        """Whether a look that found a curve of the thread's length, in the direction of what is followed,
+        tells that this runs elsewhere: beside it, where it is `likely`, or anywhere, where it is sure."""
+        away = self._away(found, followed)
+        return away >= _SAME_PX and confidence >= (likely if away < _OTHER_PX else SURE)
 
     def is_same(self, found: Nurbs, followed: Nurbs) -> bool:
         """Whether what was found is what is followed, which may lack a little at its ends."""
@@ -162,6 +172,11 @@ class Sureness:
         along = abs(np.vdot(before, now)) ** 2 / np.vdot(before, before).real
         rest = np.vdot(now, now).real - along
         return bool(rest >= len(now) * _BENT_PX**2)
+
+    def _away(self, found: Nurbs, followed: Nurbs) -> float:
+        """How far two curves are apart, px."""
+        apart = self._outline(found) - self._outline(followed)
+        return float(np.linalg.norm(apart, axis=2).max())
 
     def _outline(self, curve: Nurbs) -> Float64:
         """(2, k, 2) px, evenly spaced along the left and along the right image of the curve."""

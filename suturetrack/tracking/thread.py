@@ -30,8 +30,13 @@ _RAREST = 3
 # After so many in vain, some 5 s, it may have been cut or drawn out meanwhile: what is sure to be a thread
 # may have any length.
 _ATTEMPTS = 12
+# And so many in vain at one that is followed, a second: it may be another one that had its length.
+_LOOKS = 2
 # A thread that was never sure is no stub of what it was found as with some hope, against the longest.
 _STUB = 0.5
+# The pause between looks at a curve that other ridges may draw aside, and the confidence of one by which
+# they have.
+_PAUSE_NS, _LIKELY = 500_000_000, 0.25
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
 
@@ -66,7 +71,7 @@ class Thread:
         self._seeded_at = 0.5
         self._has_left_seed = False
         """Whether the last look from the pixel of the seed has found nothing that may be the thread."""
-        self._rest = self._failures = 0
+        self._rest = self._failures = self._vain = 0
 
     @property
     def is_held(self) -> bool:
@@ -138,10 +143,11 @@ class Thread:
     def _come_to(self, state: ThreadState) -> None:
         """What is not sure to be the thread is not called so."""
         self._followed = state
-        is_sure = self._sureness is not None and self._sureness.is_sure
+        is_sure = self._is_sure
         is_sure &= not self._strangers.is_found
         if is_sure:
             self._was_sure, self._known = True, copy.copy(self.follower)
+            self._vain = 0
         if state.status is Status.TRACKING and not is_sure:
             state = replace(state, status=Status.OCCLUDED)
         self._state = state
@@ -176,7 +182,8 @@ class Thread:
         turn = self._failures - 1 if is_beside else None
         if self.follower is not None:
             last, rig = self.follower.last_good, self.follower.rig
-            before = self._who_knows_its_length() if self._failures <= _ATTEMPTS else ()
+            is_known = self._failures <= _ATTEMPTS and self._vain < _LOOKS
+            before = self._who_knows_its_length() if is_known else ()
             return Again(self._seed, self._setup, last, lengths(before), rig, before, turn)
         assert self._state.curve is not None
         known = (self._state.length,) if self._failures <= _QUICK_ATTEMPTS else ()
@@ -186,10 +193,12 @@ class Thread:
         assert self.follower is not None
         assert self._sureness is not None
         curve = self.follower.model.curve
-        if not self._sureness.asks_for_look(curve, now_ns):
+        is_due = self._may_be_aside and now_ns - self.looked_ns >= _PAUSE_NS
+        if not (is_due or self._sureness.asks_for_look(curve, now_ns)):
             return None
         place, self._has_left_seed = self._place_to_look_from(curve), False
-        return Closer(place, self._setup, curve, self._who_knows_its_length())
+        before = self._who_knows_its_length() if self._vain < _LOOKS else ()
+        return Closer(place, self._setup, curve, before)
 
     def _who_knows_its_length(self) -> tuple[Follower, ...]:
         """Who follows the thread, and who did when that was sure last: another curve may have been taken
@@ -208,21 +217,24 @@ class Thread:
         x, y, z = (float(c) for c in evaluate(curve, np.array([self._seeded_at]))[0])
         return Seed(self.name, point=(x, y, z))
 
-    def take_up(self, look: Look, others: Neighbours) -> None:
-        """Goes on with what a look found, if that is worth more.
+    def take_up(self, look: Look, others: Neighbours) -> bool:
+        """Goes on with what a look found, if that is worth more; whether it tells anything new.
 
         Who was lost when the look began may be held by now where it has led.
         """
+        was_sure, before = self._is_sure, self._pursuit
         self._rest = max(self._rest - look.fields + 1, 0)
         outcome, search = look.outcome(), look.search
         if isinstance(search, FromSeed):
             self._take_first(outcome, look.fields)
         elif outcome.pursuit is None or outcome.pursuit.lies_on(others):
             self._has_left_seed = search.seed is self._seed
+            self._vain += isinstance(search, Closer) and not self._is_sure
         elif isinstance(search, Again):
             self._take_again(outcome, search.known_lengths)
         else:
             self._take_closer(search, outcome)
+        return not was_sure or self._pursuit is not before
 
     def doubt_beside(self, others: Neighbours, now_ns: int) -> None:
         """Calls a curve open, and its length unknown, whose end runs on along threads that are surer."""
@@ -283,6 +295,12 @@ class Thread:
             return
         if self._is_stub(outcome.state):
             return
+        if self._puts_right(found, outcome.state):
+            self._hold(outcome, "put right", self._sureness)
+            return
+        may_be_unsure = bool(search.before) or not self._was_sure
+        if self._is_sure or not (may_be_unsure or found.confidence >= SURE):
+            return
         if self._sureness.weigh(found, search.followed):
             self._seeded_at = _nearest(found.curve, search.seed, self._setup.rig)
             event = "found for sure" if self._sureness.is_sure else "found elsewhere"
@@ -308,6 +326,30 @@ class Thread:
         if not self._sureness.is_hopeless:
             self._longest = max(self._longest, state.length)
         self._come_to(replace(state, events=(event, *state.events)))
+
+    def _puts_right(self, found: Initialization, state: ThreadState) -> bool:
+        """Whether other ridges have drawn the curve aside, and a look finds where it should run."""
+        assert self.follower is not None
+        assert self._sureness is not None
+        assert state.curve is not None
+        if state.status is not Status.TRACKING or not self._may_be_aside:
+            return False
+        known, curve = self.follower.known_length, self.follower.model.curve
+        has_length = not known.is_another(state.length, known.now, 0.0, is_clear=False)
+        has_length &= not known.is_exceeded(state.length, 0.0)
+        likely = 0.0 if self.follower.makes_detour else _LIKELY
+        return has_length and self._sureness.outweighs(
+            found.confidence, state.curve, curve, likely=likely
+        )
+
+    @property
+    def _may_be_aside(self) -> bool:
+        held = self.follower
+        return held is not None and (held.makes_detour or (self._is_sure and held.is_crowded))
+
+    @property
+    def _is_sure(self) -> bool:
+        return self._sureness is not None and self._sureness.is_sure
 
     @property
     def _is_uncertain(self) -> bool:

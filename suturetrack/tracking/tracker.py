@@ -167,7 +167,8 @@ class Tracker:
 
     def _take_up(self, look: Look, others: Neighbours, stamp: Stamp) -> None:
         """Takes up what a look found; whoever is less sure and runs along it comes to be doubted."""
-        self._threads[look.thread].take_up(look, others)
+        if not self._threads[look.thread].take_up(look, others):
+            return
         for other in self._threads.values():
             if other.name != look.thread and other.is_held:
                 other.doubt_beside(self._others(other, stamp), stamp.capture_ns)
