@@ -590,6 +590,29 @@ def test_a_curve_that_another_ridge_has_drawn_aside_is_put_right_by_a_look(
     assert rms(states[-1], truth if is_put_right else other) < 0.15
 
 
+def test_a_look_at_a_sure_curve_holds_no_recovery_up(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth, other = lens(1.2), lens(-0.2)
+    looked: list[int] = []
+
+    def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
+        looked.append(field.stamp.frame)
+        found = initialize(paint(rig, [truth], 0), rig, seed_on(rig, truth))
+        return replace(found, confidence=0.9)
+
+    lost_at = round(0.5 * FPS) + 2
+    loses_the_first(monkeypatch, lost_at)
+    looks_by(monkeypatch, look)
+    tracker = Tracker(rig)
+    tracker.seed(seed_on(rig, truth))
+    fields = [paint(rig, [truth, other], i) for i in range(lost_at + 3)]
+    states = [tracker.step(field).states[0] for field in fields]
+    assert lost_at - DELAY < looked[1] < lost_at
+    assert states[lost_at - 1].status is states[-1].status is Status.TRACKING
+    assert any("found again" in state.events for state in states[lost_at:])
+
+
 def test_doubts_run_with_the_curve(rig: StereoRig) -> None:
     found = initialize(paint(rig, [thread(0.0)], 0), rig, seed_on(rig, thread(0.0)))
     found = replace(found, doubts=(((0.2, 0.5),), ()))

@@ -216,7 +216,7 @@ class Follower:
         last = length_of(self.last_good)
         is_another = known.is_another(length, last, noise, is_clear=is_clear)
         self.is_crowded = bool((plain & evidence.alone).mean() <= _ALL)
-        self.makes_detour = self.is_crowded and known.is_exceeded(length, noise)
+        self.makes_detour = not is_clear and known.is_exceeded(length, noise)
         if self._lost and (is_another or plain.mean() < 1 - ASTRAY):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)

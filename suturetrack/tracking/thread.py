@@ -79,6 +79,12 @@ class Thread:
         return self._state.status is not Status.LOST
 
     @property
+    def is_astray(self) -> bool:
+        """Whether it has to be found again."""
+        is_doubtful = self.follower is not None and self.follower.is_doubtful
+        return not self.is_held or (self._state.status is Status.OCCLUDED and is_doubtful)
+
+    @property
     def is_sought(self) -> bool:
         """Whether it has not been found from its seed yet, nor been given up."""
         return self._state.curve is None and self._patience > 0
@@ -124,7 +130,7 @@ class Thread:
         else:
             self._strangers = self._strangers.of_another()
         self._come_to(state)
-        if self.is_held and not self._is_uncertain:
+        if not self.is_astray:
             self._rest = self._failures = 0
 
     def _look_for_strangers(
@@ -160,7 +166,7 @@ class Thread:
         """
         if self._state.curve is None:
             search = self._search_from_seed()
-        elif not self.is_held or self._is_uncertain:
+        elif self.is_astray:
             search = self._search_again(is_beside)
         else:
             search = self._search_closer(now_ns)
@@ -350,11 +356,6 @@ class Thread:
     @property
     def _is_sure(self) -> bool:
         return self._sureness is not None and self._sureness.is_sure
-
-    @property
-    def _is_uncertain(self) -> bool:
-        is_doubtful = self.follower is not None and self.follower.is_doubtful
-        return self._state.status is Status.OCCLUDED and is_doubtful
 
 
 def _nearest(curve: Nurbs, seed: Seed, rig: StereoRig) -> float:

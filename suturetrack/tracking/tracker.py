@@ -126,11 +126,17 @@ class Tracker:
         )
 
     def _go_on_looking(self, field: RidgeField) -> Iterator[Look]:
-        """Hands the field to the look that is being made; gives it when it is due."""
+        """Hands the field to the look that is being made; gives it when it is due.
+
+        A closer look gives way where the thread has to be found again.
+        """
         look = self._look
         if look is None:
             return
         thread = self._threads[look.thread]
+        if isinstance(look.search, Closer) and thread.is_astray:
+            self._look = None
+            return
         others = self._others(thread, field.stamp)
         look.add(self._worker, field.of(look.thread), others)
         if field.stamp.capture_ns >= look.due_ns:
