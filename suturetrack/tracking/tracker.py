@@ -126,17 +126,11 @@ class Tracker:
         )
 
     def _go_on_looking(self, field: RidgeField) -> Iterator[Look]:
-        """Hands the field to the look that is being made; gives it when it is due.
-
-        A closer look gives way where the thread has to be found again.
-        """
+        """Hands the field to the look that is being made; gives it when it is due."""
         look = self._look
         if look is None:
             return
         thread = self._threads[look.thread]
-        if isinstance(look.search, Closer) and thread.is_astray:
-            self._look = None
-            return
         others = self._others(thread, field.stamp)
         look.add(self._worker, field.of(look.thread), others)
         if field.stamp.capture_ns >= look.due_ns:
@@ -152,10 +146,11 @@ class Tracker:
         """
         at_once: list[tuple[float, Thread, Look]] = []
         for thread in sorted(self._threads.values(), key=lambda thread: thread.looked_ns):
-            if self._look is not None:
-                break
             is_beside = bool(held - {thread.name})
-            search = thread.search(field.stamp.capture_ns, is_beside)
+            # A look at what is followed holds no recovery up.
+            is_urgent = thread.is_astray and not is_beside
+            is_free = self._look is None or (is_urgent and isinstance(self._look.search, Closer))
+            search = thread.search(field.stamp.capture_ns, is_beside) if is_free else None
             if search is None:
                 continue
             own = field.of(thread.name)
