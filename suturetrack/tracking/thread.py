@@ -36,7 +36,7 @@ _LOOKS = 2
 _STUB = 0.5
 # The pause between looks at a curve that other ridges may draw aside, and the confidence of one by which
 # they have.
-_PAUSE_NS, _LIKELY = 500_000_000, 0.25
+_PAUSE_NS, _LIKELY = 500_000_000, 0.1
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
 
@@ -229,8 +229,9 @@ class Thread:
         Who was lost when the look began may be held by now where it has led.
         """
         was_sure, before = self._is_sure, self._pursuit
-        self._rest = max(self._rest - look.fields + 1, 0)
         outcome, search = look.outcome(), look.search
+        if isinstance(search, Again):
+            self._rest = max(self._rest - look.fields + 1, 0)
         if isinstance(search, FromSeed):
             self._take_first(outcome, look.fields)
         elif outcome.pursuit is None or outcome.pursuit.lies_on(others):
