@@ -215,7 +215,7 @@ class Follower:
         length, is_clear = length_of(model.curve), _is_clear(plain, evidence)
         last = length_of(self.last_good)
         is_another = known.is_another(length, last, noise, is_clear=is_clear)
-        self.is_crowded = bool((plain & evidence.alone).mean() <= _ALL)
+        self.is_crowded = bool(evidence.alone.mean() <= _ALL)
         self.makes_detour = not is_clear and known.is_exceeded(length, noise)
         if self._lost and (is_another or plain.mean() < 1 - ASTRAY):
             return Status.LOST
