@@ -53,6 +53,7 @@ class Stage:
         self.snaps = self.system.every(topics.SNAP)
         self.robot = Client(Bus(hub.connect(), "rig", "client"))
         self.seeds: list[Seed] = []
+        self.silent = threading.Event()
         config = TooltipConfig(hand_eye)
         self.service = Service("tooltip", ServiceConfig(), Bus(hub.connect(), "rig", "tooltip"))
         body = lambda: tooltip.run(self.service, config)  # noqa: E731
@@ -62,7 +63,6 @@ class Stage:
         ]
         for each in self.threads:
             each.start()
-        self.silent = threading.Event()
 
     def find(self, seed: Seed) -> SeedReply:
         self.seeds.append(seed)
