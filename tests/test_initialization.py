@@ -205,6 +205,45 @@ def loop_with_a_shared_run() -> Float64:
     return np.r_[around[0] - lead * before, around, around[-1] + lead[::-1] * after]
 
 
+def bend_in_the_line_of_sight(rig: StereoRig, aside_px: float) -> Float64:
+    """(1500, 3) a thread that turns round at one place of the left view, where both arms come together."""
+    t = np.linspace(-1, 1, 1500)
+    along, aside, depth = 220 * (1 - t**2), aside_px * t**3, 200 + 12 * t
+    u, v = 220 + 0.87 * along - 0.5 * aside, 200 + 0.5 * along + 0.87 * aside
+    centre = np.asarray(rig.left.projection)[:2, 2]
+    return np.c_[(np.c_[u, v] - centre) / rig.focal * depth[:, None], depth]
+
+
+@pytest.mark.parametrize("aside_px", [60.0, 120.0])
+@pytest.mark.parametrize("seed_at", [150, 1350])
+def test_a_thread_that_turns_round_in_the_line_of_sight_is_followed_back(
+    rig: StereoRig, aside_px: float, seed_at: int
+) -> None:
+    truth = bend_in_the_line_of_sight(rig, aside_px)
+    left, right = rig.project(truth)
+    field = field_of(draw(left, rig), draw(right, rig), rig)
+    found = initialize(field, rig, Seed(pixel=tuple(left[seed_at])))
+    error = curve_error(dense(found.curve), truth)
+    assert abs(error.length_percent) < 3
+    assert max(error.ends) < 1
+    assert any("sharp bend" in reason for reason in found.reasons)
+
+
+def test_a_thread_that_ends_on_another_one_far_from_its_end_is_not_taken_for_a_bend(
+    rig: StereoRig,
+) -> None:
+    t = np.linspace(0, 1, 800)[:, None]
+    one = np.array([-50.0, -20.0, 200.0]) + t * [100.0, 30.0, 10.0]
+    other = np.array([-45.0, 25.0, 215.0]) + t * (one[400] - [-45.0, 25.0, 215.0])
+    left, right = (
+        draw(b, rig, draw(a, rig))
+        for a, b in zip(rig.project(one), rig.project(other), strict=True)
+    )
+    seed = tuple(rig.project(one[150])[0])
+    found = initialize(field_of(left, right, rig), rig, Seed(pixel=seed))
+    assert abs(curve_error(dense(found.curve), one).length_percent) < 3
+
+
 @pytest.mark.parametrize("crosses", [True, False])
 def test_crest_lines_that_touch_where_both_turn_are_cut_there(crosses: bool) -> None:
     """A crossing may look like two bends back to back; what passes a bend straight is no crossing."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from suturetrack.initialization.depth import Depth
+from suturetrack.initialization.hairpins import double_stubs, other_end
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.pricing import FREE_END, Merge, price_merges
 from suturetrack.initialization.segments import ARM, Ridges
@@ -79,6 +80,7 @@ def _merge(ridges: Ridges, merges: Merge, strands: Strands | None) -> Merged:
         _uncross(ridges.segments, partner, price, strands)
     segments = _share(ridges.segments, partner, price, strands)
     _open_rings(partner, price)
+    segments = double_stubs(segments, partner, price)
     _pair(partner, merges.pairs[order[merges.touching[order]]])
     bent = _bent(ridges.segments, segments, partner, strands)
     return Merged(segments, partner, price, bent, _bridge_hidden(ridges, partner, price, strands))
@@ -112,7 +114,7 @@ def _bridge_hidden(
     for energy, i, j in sorted(ways):
         if energy > _ONE_STRAND:
             break
-        if i not in partner and j not in partner and _leads_to(i, partner) != j:
+        if i not in partner and j not in partner and other_end(i, partner) != j:
             for one, other in ((i, j), (j, i)):
                 partner[one] = other
                 price.setdefault((one, other), FREE_END)
@@ -224,8 +226,8 @@ def _double(
     start, stop = run[0], run[-1] ^ 1
     first, last = partner[start], partner[stop]
     # Of the two ways to connect the strands none may close a loop; else the smoother one is taken.
-    ring = _leads_to(one, partner) == other or _is_ring(start, partner)
-    if ring or other == _leads_to(first, partner) or one == _leads_to(last, partner):
+    ring = other_end(one, partner) == other or _is_ring(start, partner)
+    if ring or other == other_end(first, partner) or one == other_end(last, partner):
         swap = ring
     else:
         straight, crossed = [(one, other), (first, last)], [(one, last), (first, other)]
@@ -282,14 +284,6 @@ def _is_ring(start: int, partner: dict[int, int]) -> bool:
         if end == start ^ 1:
             return True
     return False
-
-
-def _leads_to(end: int, partner: dict[int, int]) -> int:
-    """The free end at the other side of the chain of segments that begins at the free `end`."""
-    end ^= 1
-    while end in partner:
-        end = partner[end] ^ 1
-    return end
 
 
 def follow(start: int, partner: dict[int, int]) -> list[int]:
