@@ -12,7 +12,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
 from suturetrack.initialization.segments import split_at_touches
-from suturetrack.metrics import curve_error, polyline_distances
+from suturetrack.metrics import curve_error, polyline_distances, polyline_length
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import Picture, Scene, open_scene
 from suturetrack.types import (
@@ -203,6 +203,38 @@ def loop_with_a_shared_run() -> Float64:
     before, after = around[1] - around[0], around[-1] - around[-2]
     lead = np.linspace(1500, 1, 800)[:, None]
     return np.r_[around[0] - lead * before, around, around[-1] + lead[::-1] * after]
+
+
+def random_thread(rig: StereoRig, seed: int) -> Float64:
+    """(1500, 3) a smooth curve of a random shape, far from the cameras, that both show whole."""
+    rng = np.random.default_rng(seed)
+    while True:
+        heading, corners = rng.normal(size=3), [np.zeros(3)]
+        for _ in range(rng.integers(6, 9)):
+            heading = heading / np.linalg.norm(heading) + 0.8 * rng.normal(size=3)
+            corners.append(corners[-1] + heading * rng.uniform(0.5, 1.5))
+        corners = np.array(corners) - np.mean(corners, axis=0) + [0, 0, 8.5]
+        knots = nurbs.clamped_knots(np.linspace(0, 1, len(corners) - 2)[1:-1], 3)
+        points = dense(nurbs.curve_from(3, knots, corners))
+        left, right = rig.project(points)
+        inside = (np.r_[left, right] > 10) & (np.r_[left, right] < [629, 469])
+        if points[:, 2].min() > 5 and inside.all() and polyline_length(left) > 250:
+            return points
+
+
+def test_threads_of_any_shape_are_found_whole_from_far_away() -> None:
+    """Bends in the line of sight, small loops and ends along epipolar lines; a pixel of disparity is a
+    twelfth of the distance."""
+    rig = make_rig(baseline=0.1)
+    errors = []
+    for seed in range(12):
+        truth = random_thread(rig, seed)
+        left, right = rig.project(truth)
+        field = field_of(draw(left, rig, width=1), draw(right, rig, width=1), rig)
+        found = initialize(field, rig, Seed(pixel=tuple(left[750])))
+        errors.append(curve_error(dense(found.curve, 600), truth))
+    assert max(error.mean for error in errors) < 0.07
+    assert max(abs(error.length_percent) for error in errors) < 5
 
 
 def bend_in_the_line_of_sight(rig: StereoRig, aside_px: float) -> Float64:

@@ -10,9 +10,10 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization.confidence import judge
 from suturetrack.initialization.crest import View
 from suturetrack.initialization.ends import move_end, read_end
-from suturetrack.initialization.fitting import fit_marks, image_parameters, refine
+from suturetrack.initialization.fitting import refine
 from suturetrack.initialization.growth import Thread, follow_thread, grow_thread, nearest_segment
 from suturetrack.initialization.hypotheses import Hypothesis, find_thread
+from suturetrack.initialization.knots import fit_marks, image_parameters
 from suturetrack.initialization.matching import Match, match, raised, row_offset
 from suturetrack.initialization.model import (
     Growth,

@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.doubts import CROSSING, FADES, FOREIGN, HIDDEN, Doubt
-from suturetrack.initialization.fitting import Samples
 from suturetrack.initialization.growth import Chain
 from suturetrack.initialization.model import PlacedDoubts, remaining
+from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import Ridges
 from suturetrack.metrics import coverage, polyline_length
 from suturetrack.types import Float64, Nurbs

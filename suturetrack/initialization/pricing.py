@@ -22,6 +22,9 @@ _HOOKED = 7
 """Points at the end of a segment that a highlight beside it may have drawn aside."""
 _SHORT = 0.25
 """Price of a merge with a segment too short to have a direction."""
+_CLOSED = 0.4
+"""Distance between the ends of a segment, against its length, below which it is a loop: a small one heads
+another way after a few points."""
 _SWING = 0.01
 """Price of a bridge that bends one way and then the other."""
 _BRIDGE_SAMPLES = 12
@@ -101,7 +104,9 @@ def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
 
 def _arm(segment: Float64, clear: int) -> Float64:
     first = min(clear, len(segment) // 4)
-    return segment[first : first + ARM - _CLEAR]
+    arm = segment[first : first + ARM - _CLEAR]
+    is_loop = np.linalg.norm(segment[-1] - segment[0]) < _CLOSED * len(segment)
+    return arm[: max(len(segment) // 4, 3)] if is_loop else arm
 
 
 def _bridge_prices(
