@@ -19,7 +19,7 @@ from suturetrack.contrast import (
     contrast_along,
     contrast_at,
 )
-from suturetrack.kernels import ridge
+from suturetrack.kernels import ridge, rims
 from suturetrack.silhouette import is_cut_out, silhouette_scale, silhouettes
 from suturetrack.types import (
     Float32,
@@ -44,8 +44,6 @@ _WEIGHTS = {
     "red": np.array([0.0, 0.0, 1.0]),
 }
 _SIGNS = {"auto": (1.0, 1.0), "dark": (1.0, 1.0), "bright": (-1.0, -1.0), "both": (-1.0, 1.0)}
-# Hue by half the angle in degrees: OpenCV's 180 hues for the directions of half a turn.
-_HUES = (2 * np.arange(256) % 180).astype(np.uint8)
 # Fields whose buffers are in use at the same time.
 _SLOTS = 4
 # Share of the way that the automatic c, and a learned contrast, go at each step.
@@ -383,7 +381,7 @@ class _View:
         taps = ridge.taps_of(look.sigmas)
         ridge.ridge_field(plane, *taps, shape, look.signs, self._kernel, out, self._strength)
         if look.relative and look.signs == _SIGNS["dark"]:
-            ridge.fade_rims(plane, _GROUND * max(look.sigmas), out)
+            rims.fade_rims(plane, _GROUND * max(look.sigmas), out)
 
     def _automatic_c(self) -> float:
         return max(math.sqrt(ridge.quantile(self._strength, 0.998)) / 2, _LEAST_C)
@@ -394,32 +392,3 @@ def gaussian_kernel(sigma: float) -> Float32:
     g = np.exp(-(np.arange(-2, 3) ** 2) / (2 * sigma**2))
     kernel = np.outer(g, g)
     return (kernel / kernel.sum()).astype(np.float32)
-
-
-def direction_image(field_view: Float32) -> Image:
-    """The field of one view in false colour (Fig. 2): hue is direction, brightness is length.
-
-    Args:
-        field_view: (H, W, 2) float32, a view of a `RidgeField`.
-
-    Returns:
-        (H, W, 3) uint8 BGR.
-    """
-    u, v = cv2.split(field_view)
-    length, angle = cv2.cartToPolar(u, v, angleInDegrees=True)
-    hue = cv2.LUT(cv2.convertScaleAbs(angle, alpha=0.5), _HUES)
-    value = cv2.convertScaleAbs(length, alpha=255)
-    return cv2.cvtColor(cv2.merge([hue, np.full_like(hue, 255), value]), cv2.COLOR_HSV2BGR)
-
-
-def direction_key(size: int = 64) -> Image:
-    """The key to `direction_image`: a wheel in which every spoke has the colour of its direction.
-
-    Returns:
-        (size, size, 3) uint8 BGR, black outside the wheel.
-    """
-    axis = np.linspace(-1, 1, size, dtype=np.float32)
-    spokes = np.dstack(np.meshgrid(axis, axis))
-    radius = np.linalg.norm(spokes, axis=-1, keepdims=True)
-    wheel = (radius > 0.25) & (radius <= 1)
-    return direction_image(np.where(wheel, spokes / np.maximum(radius, 0.25), 0).astype(np.float32))

@@ -9,8 +9,8 @@ from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.ends import EndStep, EndWatch, end_shift, find_end
+from suturetrack.tracking.energies import measure_levels
 from suturetrack.tracking.folds import doubled_ends
-from suturetrack.tracking.follower import measure_levels
 from suturetrack.types import Nurbs, Seed, Stamp, StereoFrame
 from tests.painting import paint
 

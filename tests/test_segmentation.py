@@ -15,12 +15,11 @@ from scipy.special import expit
 
 from suturetrack.camera import StereoRig
 from suturetrack.contrast import GRAY, SIGMAS, contrast_along, contrast_at
-from suturetrack.kernels import ridge
+from suturetrack.directions import direction_image, direction_key
+from suturetrack.kernels import ridge, rims
 from suturetrack.segmentation import (
     SegmentationConfig,
     Segmenter,
-    direction_image,
-    direction_key,
     gaussian_kernel,
 )
 from suturetrack.silhouette import is_cut_out
@@ -243,7 +242,7 @@ def test_no_image_is_allocated_once_warm(rectified: bool, distorted_rig: StereoR
 
 
 _WARMS_UP = """
-from suturetrack.kernels import ridge
+from suturetrack.kernels import ridge, rims
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.types import Seed, Stamp, StereoFrame
@@ -358,7 +357,7 @@ def test_rims_fade_as_in_the_literal_twin(
     plane = plane.astype(np.float32)
     twin = reference.fade_rims(plane.astype(float), field.astype(float), reach)
     faded = field.copy()
-    ridge.fade_rims(plane, reach, faded)
+    rims.fade_rims(plane, reach, faded)
     # Where a place lies halfway between two pixels, rounding may take the other one.
     assert np.mean(np.abs(faded - twin).max(-1) > 1e-3) < 0.01
     assert not np.array_equal(faded, field)

@@ -22,6 +22,7 @@ from services.drawing.common import (
     unrectified,
 )
 from suturetrack.camera import StereoRig
+from suturetrack.directions import direction_image
 from suturetrack.initialization import (
     Growth,
     Initialization,
@@ -29,7 +30,6 @@ from suturetrack.initialization import (
     ViewGrowth,
     seed_pixel,
 )
-from suturetrack.segmentation import direction_image
 from suturetrack.types import Float32, Float64, Image, RidgeField, Seed, Stamp
 
 STEPS = 10

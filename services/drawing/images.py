@@ -23,7 +23,7 @@ from services.drawing.common import (
 )
 from services.drawing.growth import style as growth_style
 from suturetrack.camera import Camera, StereoRig
-from suturetrack.segmentation import direction_image, direction_key
+from suturetrack.directions import direction_image, direction_key
 from suturetrack.types import Float64, RidgeField, StereoFrame
 
 _KEY_PX = 129

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
-from suturetrack.tracking.sampling import View, values_at, views
+from suturetrack.tracking.sampling import View, distinct, values_at, views
 from suturetrack.types import Float64, Nurbs, RidgeField
 
 _STEP_PX = 0.5
@@ -337,3 +338,11 @@ def _extension(curve: Nurbs, end: int, beyond: Float64) -> tuple[Float64, Float6
     points = points + outer * sign * tip + outer**2 / 2 * bend
     first = np.where(outer > 0, tip + sign * outer * bend, first)
     return points, first
+
+
+def with_ends(curve: Nurbs, start: float, stop: float) -> Nurbs:
+    """The curve over [start, stop]; beyond its ends only where it has knots for that."""
+    inner = distinct(curve.knots)[[1, -2]]
+    if len(curve.control_points) > 4 and start < inner[0] and stop > inner[1]:
+        return nurbs.with_ends(curve, start, stop)
+    return nurbs.part(curve, max(start, 0.0), min(stop, 1.0))

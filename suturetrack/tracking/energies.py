@@ -1,4 +1,4 @@
-"""The energies of the paper, for either method."""
+"""What the field answers along a curve: the energies of the paper, and the level of a clear view."""
 
 from __future__ import annotations
 
@@ -21,12 +21,23 @@ def energies(
     samples = Samples.of(curve.knots, 5)
     points, first, second = (samples.values(curve.control_points, d) for d in range(3))
     images = [
-        -float(np.sum(samples.share * search.responses(image, view.pixels, view.tangents)))
+        -float(np.sum(samples.share * _response(image, view)))
         for image, view in zip((field.left, field.right), views(rig, points, first), strict=True)
     ]
     return Energies(
         images[0], images[1], _end(curve, field, rig, cutoffs), _bending(first, second, samples)
     )
+
+
+def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[float, float]:
+    """Median response along a curve that lies on the thread, left and right."""
+    samples = Samples.of(curve.knots, 5)
+    both = views(rig, samples.values(curve.control_points), samples.values(curve.control_points, 1))
+    left, right = (
+        float(np.median(_response(image, view)))
+        for image, view in zip((field.left, field.right), both, strict=True)
+    )
+    return max(left, 0.05), max(right, 0.05)
 
 
 def _end(curve: Nurbs, field: RidgeField, rig: StereoRig, cutoffs: tuple[float, float]) -> float:

@@ -9,14 +9,14 @@ import numpy as np
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import search
 from suturetrack.tracking import gauss_newton, paper
 from suturetrack.tracking.alignment import shifted, shown
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange
 from suturetrack.tracking.crowding import covered
-from suturetrack.tracking.ends import EndStep, EndWatch, find_end
-from suturetrack.tracking.energies import energies
+from suturetrack.tracking.ends import EndStep, EndWatch, find_end, with_ends
+from suturetrack.tracking.energies import energies, measure_levels
+from suturetrack.tracking.fitting import fit_widely
 from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.motion import Motion
@@ -30,23 +30,15 @@ from suturetrack.tracking.reliability import (
     judge,
     loose_ends,
 )
-from suturetrack.tracking.sampling import Samples, distinct, length_of, values_at, views
+from suturetrack.tracking.sampling import length_of, values_at, views
 from suturetrack.tracking.spacing import respace
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
 from suturetrack.types import Bool, Nurbs, RidgeField, Status, ThreadState
 
 _NS = 1e-9
-# Searches, in units of the first: tried where less than the second is seen, taken if they show more.
-_WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
-_ENOUGH, _GAIN = 0.97, 0.02
-_DROP = 0.01
 # An end that is drawn out further than the first is looked at again in the same field, so often at most.
 _LEAP_PX, _LEAPS = 5.0, 6
-_RETRY = 5
-_NOISE_SIGMAS = 3.0
 _ALL = 0.97
-# Share that has to run alone, so that the others, which other ridges draw aside, hardly make it longer.
-_CLEAR = 0.94
 _SURE_AFTER_S = 0.08
 # Standard deviation, against its length, from which on the images do not tell where a curve runs.
 _VAGUE = 0.0225
@@ -193,7 +185,7 @@ class Follower:
         is_whole = plain.mean() > _ALL
         # Where all of it is plain to see and an end seems to go on, the end has met something else;
         # where it is not, the curve makes a detour.
-        overlong = known.is_outgrown(length if is_whole else ends.wanted, _noise(evidence))
+        overlong = known.is_outgrown(length if is_whole else ends.wanted, evidence.length_noise)
         if plain.mean() >= 1 - ASTRAY and ends.settled and known.is_cut:
             known = known.given_up(min(known.now, ends.length))
         wrong = astray | (~plain & overlong)
@@ -201,7 +193,7 @@ class Follower:
         is_certain &= not (overlong or known.is_short(length))
         has_ends = bool(plain[[0, 1, -2, -1]].all())
         if is_certain and is_whole and has_ends and not (self._lost or known.is_cut):
-            known = known.learned(ends, seconds, may_grow=_is_clear(plain, evidence))
+            known = known.learned(ends, seconds, may_grow=evidence.is_clear(plain))
         self.known_length = known
         if not is_certain:
             self._doubted_ns = model.capture_ns
@@ -211,8 +203,8 @@ class Follower:
 
     def _status(self, evidence: Evidence, plain: Bool, uncertain_s: float) -> Status:
         """The status; a curve that was lost must have its length again, and be seen, to be held."""
-        model, known, noise = self.model, self.known_length, _noise(evidence)
-        length, is_clear = length_of(model.curve), _is_clear(plain, evidence)
+        model, known, noise = self.model, self.known_length, evidence.length_noise
+        length, is_clear = length_of(model.curve), evidence.is_clear(plain)
         last = length_of(self.last_good)
         is_another = known.is_another(length, last, noise, is_clear=is_clear)
         self.is_crowded = bool(evidence.alone.mean() <= _ALL)
@@ -288,7 +280,17 @@ class Follower:
         self, field: RidgeField, predicted: Nurbs, neighbours: Neighbours
     ) -> tuple[Evidence, int, int]:
         model = self.model
-        best = self._search(predicted, field, neighbours.shown_in(field, model.levels))
+        best = fit_widely(
+            model.curve,
+            predicted,
+            field,
+            self.rig,
+            model.levels,
+            self._share,
+            self.config,
+            neighbours.shown_in(field, model.levels),
+        )
+        self._share = best.share
         # What was just drawn out may have been drawn out in depth.
         model.curve = best.without_half_seen_tips() if self._leaps.any() else best.fit.curve
         self._leaps = np.zeros(2, bool)
@@ -335,32 +337,6 @@ class Follower:
         if start or stop:
             model.curve = nurbs.part(model.curve, start, 1.0 - stop)
 
-    def _search(self, predicted: Nurbs, field: RidgeField, neighbours: Neighbours) -> Evidence:
-        """Looks further away for what was seen before, and now and then for what is hidden."""
-        before, levels, config = self.model.curve, self.model.levels, self.config
-
-        def fitted(start: Nurbs, reach_px: float) -> Evidence:
-            return Evidence.of(
-                gauss_newton.fit(
-                    before, start, field, self.rig, levels, reach_px, config, neighbours
-                )
-            )
-
-        best = fitted(predicted, config.search_px)
-        usual = 1.0 if field.stamp.frame % _RETRY == 0 else self._share - _DROP
-        if best.share < min(_ENOUGH, usual):
-            jumped = fitted(shifted(predicted, field, self.rig, levels), config.search_px)
-            if jumped.share > best.share + _GAIN:
-                best = jumped
-        for times, enough, gain in _WIDER:
-            if best.share >= min(enough, usual):
-                break
-            tried = fitted(predicted, times * config.search_px)
-            if tried.share > best.share + gain:
-                best = tried
-        self._share = best.share
-        return best
-
     def _adjust_ends(self, field: RidgeField, crowded: Bool, known: Bool, cut: float) -> None:
         """Moves the ends.
 
@@ -383,7 +359,7 @@ class Follower:
             is_known=self.known_length.is_established,
         )
         if start or stop:
-            model.curve = _with_ends(model.curve, -start, 1.0 + stop)
+            model.curve = with_ends(model.curve, -start, 1.0 + stop)
         self._leaps = np.array(
             [
                 step is not None and min(moved, start + stop - cut) > _LEAP_PX * step.pixel
@@ -424,31 +400,3 @@ class Follower:
             seen=evidence.evenly_seen,
             events=tuple(events),
         )
-
-
-def _noise(evidence: Evidence) -> float:
-    """What noise in depth makes of a length."""
-    return _NOISE_SIGMAS * float(np.median(evidence.sigma))
-
-
-def _is_clear(plain: Bool, evidence: Evidence) -> bool:
-    """Whether nearly all of the thread is plain to see, with no other ridge beside it."""
-    return bool((plain & evidence.alone).mean() > _CLEAR)
-
-
-def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[float, float]:
-    """Median response along a curve that lies on the thread, left and right."""
-    samples = Samples.of(curve.knots, 5)
-    both = views(rig, samples.values(curve.control_points), samples.values(curve.control_points, 1))
-    left, right = (
-        float(np.median(search.responses(image, view.pixels, view.tangents)))
-        for image, view in zip((field.left, field.right), both, strict=True)
-    )
-    return max(left, 0.05), max(right, 0.05)
-
-
-def _with_ends(curve: Nurbs, start: float, stop: float) -> Nurbs:
-    inner = distinct(curve.knots)[[1, -2]]
-    if len(curve.control_points) > 4 and start < inner[0] and stop > inner[1]:
-        return nurbs.with_ends(curve, start, stop)
-    return nurbs.part(curve, max(start, 0.0), min(stop, 1.0))

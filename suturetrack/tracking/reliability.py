@@ -37,6 +37,9 @@ _ANYWHERE_PX, _HOPELESS_PX, _GONE_PX, _MOVED_PX = 5.0, 15.0, 8.0, 2.0
 # seen on both of its sides to hold it.
 _BULGE, _HOLD = 0.15, 0.12
 _GAP = 5
+# Share that has to run alone, so that the others, which other ridges draw aside, hardly make it longer.
+_CLEARLY = 0.94
+_NOISE_SIGMAS = 3.0
 # Share of the curve that the tips are at most.
 _TIPS = 0.1
 _BORDER_PX = 10.0
@@ -91,6 +94,15 @@ class Evidence:
     def alone(self) -> Bool:
         """(k,) whether no other ridge runs close beside the thread, at evenly spaced parameters."""
         return ~self._even(self.fit.crowded)
+
+    @property
+    def length_noise(self) -> float:
+        """What noise in depth makes of a length."""
+        return _NOISE_SIGMAS * float(np.median(self.sigma))
+
+    def is_clear(self, plain: Bool) -> bool:
+        """Whether nearly all of the thread is plain to see, with no other ridge beside it."""
+        return bool((plain & self.alone).mean() > _CLEARLY)
 
     def astray(
         self,

@@ -1,0 +1,61 @@
+"""The curve laid on a field: from where it is predicted, and further away where less is seen than before."""
+
+from __future__ import annotations
+
+from suturetrack.camera import StereoRig
+from suturetrack.tracking import gauss_newton
+from suturetrack.tracking.alignment import shifted
+from suturetrack.tracking.config import TrackingConfig
+from suturetrack.tracking.reliability import Evidence
+from suturetrack.tracking.strands import Neighbours
+from suturetrack.types import Nurbs, RidgeField
+
+# Searches, in units of the first: tried where less than the second is seen, taken if they show more.
+_WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
+_ENOUGH, _GAIN = 0.97, 0.02
+_DROP = 0.01
+# Fields after which what is hidden is looked for further away, too.
+_RETRY = 5
+
+
+def fit_widely(
+    before: Nurbs,
+    predicted: Nurbs,
+    field: RidgeField,
+    rig: StereoRig,
+    levels: tuple[float, float],
+    share: float,
+    config: TrackingConfig,
+    neighbours: Neighbours,
+) -> Evidence:
+    """Looks further away for what was seen before, and now and then for what is hidden.
+
+    Args:
+        before: the curve in the last field.
+        predicted: where it should be in this one.
+        field: what shows it.
+        rig: the cameras.
+        levels: response of a clear view of the thread, left and right.
+        share: what was seen of it in the last field.
+        config: how far is looked.
+        neighbours: other threads that the field shows.
+    """
+
+    def fitted(start: Nurbs, reach_px: float) -> Evidence:
+        return Evidence.of(
+            gauss_newton.fit(before, start, field, rig, levels, reach_px, config, neighbours)
+        )
+
+    best = fitted(predicted, config.search_px)
+    usual = 1.0 if field.stamp.frame % _RETRY == 0 else share - _DROP
+    if best.share < min(_ENOUGH, usual):
+        jumped = fitted(shifted(predicted, field, rig, levels), config.search_px)
+        if jumped.share > best.share + _GAIN:
+            best = jumped
+    for times, enough, gain in _WIDER:
+        if best.share >= min(enough, usual):
+            break
+        tried = fitted(predicted, times * config.search_px)
+        if tried.share > best.share + gain:
+            best = tried
+    return best
