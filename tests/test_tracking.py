@@ -633,7 +633,7 @@ def test_a_thread_is_followed_in_the_field_of_its_own(rig: StereoRig) -> None:
 
 
 def test_an_end_beneath_another_thread_is_no_shorter(rig: StereoRig) -> None:
-    """Its own field shows nothing where the other thread lies over it, which is less than a twentieth of it."""
+    """Its own field shows nothing where the other one lies over it, on less than a twentieth."""
     x = np.linspace(-25, 25, 400)
     below = np.c_[x, 0.02 * x**2, np.full(400, 200.0)]
     tracker, lengths = Tracker(rig), []
