@@ -1,6 +1,7 @@
 """What the tracker holds shows the segmenter, once a second, how the threads look by now.
 
-Where all of them are lost they may have faded: they are looked for as if they stood out less and less.
+Where all of them are lost they may have faded: they are looked for as if they stood out less and less. One
+whose seed taught nothing, such as in the first, dark pictures of a camera, is learned where it is seen.
 """
 
 from __future__ import annotations
@@ -12,10 +13,14 @@ from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.segmentation import Segmenter
-from suturetrack.types import Status, StereoFrame, ThreadState
+from suturetrack.types import Seed, Status, StereoFrame, ThreadState
 
 _PERIOD_NS = 1_000_000_000
 """Of capture time, so that a recording adapts as the live run did."""
+_SOON_NS = 250_000_000
+"""And the period while there is a seeded thread of which nothing was learned yet."""
+_SEEN = 0.9
+"""Share of a curve that has to be seen for its thread to be learned."""
 _LONGEST_WAIT_S = 2.0
 """Lock-step: for states that are on their way."""
 
@@ -42,13 +47,15 @@ class Adaptation:
         while (state := self._states.get(0)) is not None:
             self._arrived.append(state)
         sample = self._sample
-        age = _PERIOD_NS if sample is None else frame.stamp.capture_ns - sample.stamp.capture_ns
-        if 0 <= age < _PERIOD_NS:
+        is_learned = self._segmenter.seeded <= set(self._segmenter.threads)
+        period = _PERIOD_NS if is_learned else _SOON_NS
+        age = period if sample is None else frame.stamp.capture_ns - sample.stamp.capture_ns
+        if 0 <= age < period:
             return
         if sample is not None and age > 0:
             self._learn(sample)
         self._sample = frame
-        self._awaited = set(self._segmenter.threads)
+        self._awaited = set(self._segmenter.seeded)
         self._arrived = list(self._of(frame).values())
 
     def _learn(self, sample: StereoFrame) -> None:
@@ -61,12 +68,25 @@ class Adaptation:
         all_lost = all(state.status is Status.LOST for state in states.values())
         for thread, message in sorted(states.items()):
             state = scaled(message, 1 / self._rig.metres_per_unit)
-            if state.status is Status.TRACKING and state.curve is not None:
+            if state.curve is None:
+                continue
+            if thread in self._segmenter.seeded - set(self._segmenter.threads):
+                if state.status is not Status.LOST and np.mean(state.seen) > _SEEN:
+                    self._segmenter.learn(sample, seed_on(state))
+            elif state.status is Status.TRACKING:
                 shown = np.linspace(0, 1, len(state.seen))[state.seen]
                 pixels = self._rig.project_raw(nurbs.evaluate(state.curve, shown))[0]
                 self._segmenter.adapt(sample, pixels, thread)
-            elif all_lost and state.curve is not None:
+            elif all_lost:
                 self._segmenter.fade(thread)
 
     def _of(self, frame: StereoFrame) -> dict[str, ThreadState]:
         return {state.thread: state for state in self._arrived if state.stamp == frame.stamp}
+
+
+def seed_on(state: ThreadState) -> Seed:
+    """The middle of what is seen of a thread."""
+    assert state.curve is not None
+    seen = np.linspace(0, 1, len(state.seen))[state.seen]
+    x, y, z = nurbs.evaluate(state.curve, seen[len(seen) // 2 :][:1])[0]
+    return Seed(state.thread, point=(float(x), float(y), float(z)))

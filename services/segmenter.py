@@ -10,11 +10,10 @@ import numpy as np
 import tyro
 
 from services import topics
-from services.adaptation import Adaptation
+from services.adaptation import Adaptation, seed_on
 from services.bus import Bus
 from services.service import Service, ServiceConfig, Stopped, compiling
 from services.wire import scaled
-from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.segmentation import SegmentationConfig, Segmenter
 from suturetrack.types import (
@@ -24,7 +23,6 @@ from suturetrack.types import (
     Stamp,
     Status,
     StereoFrame,
-    ThreadState,
 )
 
 _RECENT_FRAMES = 3
@@ -107,15 +105,7 @@ class _Held:
             is_seen = state.status is not Status.LOST and np.mean(state.seen) > _SEEN
             if recent and is_seen and state.thread in self.threads:
                 self.threads.remove(state.thread)
-                yield _seed_on(scaled(state, 1 / self._rig.metres_per_unit))
-
-
-def _seed_on(state: ThreadState) -> Seed:
-    """The middle of what is seen of a thread."""
-    assert state.curve is not None
-    seen = np.linspace(0, 1, len(state.seen))[state.seen]
-    x, y, z = nurbs.evaluate(state.curve, seen[len(seen) // 2 :][:1])[0]
-    return Seed(state.thread, point=(float(x), float(y), float(z)))
+                yield seed_on(scaled(state, 1 / self._rig.metres_per_unit))
 
 
 def warm_up(rig: StereoRig, config: SegmenterConfig) -> RidgeField:

@@ -106,6 +106,7 @@ class Segmenter:
         self._threads: dict[str, Contrast] = {}
         self._clear: dict[str, Contrast] = {}
         """As they were when they were seen last."""
+        self._seeded: set[str] = set()
         self._first = _Sight(rig, config, _first_look(config))
         self._sights: dict[str, _Sight] = {}
         self._all: Float32 | None = None
@@ -116,6 +117,11 @@ class Segmenter:
     def threads(self) -> tuple[str, ...]:
         """Names of the threads that were learned."""
         return tuple(self._threads)
+
+    @property
+    def seeded(self) -> frozenset[str]:
+        """Names of the threads that were to be learned, whether their seeds taught anything or not."""
+        return frozenset(self._seeded)
 
     def step(self, frame: StereoFrame) -> RidgeField:
         """The field of `frame`, in rectified pixels.
@@ -150,6 +156,7 @@ class Segmenter:
         image = self._rig.rectify(frame.left, frame.right)[0]
         pixel = self._locate(seed)
         contrast = contrast_at(image, pixel)
+        self._seeded.add(seed.thread)
         if contrast is not None:
             if self._is_cut_out:
                 contrast = replace(contrast, sigma=max(silhouette_scale(frame.left), SIGMAS[0]))
@@ -158,6 +165,7 @@ class Segmenter:
 
     def forget(self, thread: str) -> None:
         """Look for a thread no more; without any, look as before the first was learned."""
+        self._seeded.discard(thread)
         if self._threads.pop(thread, None) is not None:
             del self._clear[thread], self._sights[thread]
             self._is_cut_out &= bool(self._threads)

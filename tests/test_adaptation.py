@@ -95,6 +95,28 @@ def test_a_curve_that_is_not_sure_teaches_nothing(scenes: tuple[Scene, Scene]) -
     assert len(set(desk.fields)) == 1
 
 
+def test_a_thread_that_the_seed_did_not_show_is_learned_once_it_is_seen(
+    scenes: tuple[Scene, Scene],
+) -> None:
+    """A camera's first picture may be black; and what is doubtful teaches more than nothing."""
+    desk = Desk(scenes)
+    desk.segmenter.forget("0")
+    black = np.zeros_like(desk.images[0])
+    desk.segmenter.learn(
+        StereoFrame(Stamp(0, 0, 0), black, black), Seed(pixel=scenes[0].seed_pixel())
+    )
+    assert not desk.segmenter.threads
+    for index in range(4):
+        unseen = replace(state_of(desk.curve, Stamp(index, 0, 0)), seen=np.zeros(64, bool))
+        desk.frame(index, unseen)
+    assert len(set(desk.fields)) == 1
+    for index in range(4, 6):
+        desk.frame(index, state_of(desk.curve, Stamp(index, 0, 0), Status.OCCLUDED))
+    desk.frame(6)
+    assert desk.segmenter.threads == ("0",)
+    assert len(set(desk.fields)) == 2
+
+
 def test_a_lost_thread_beside_one_that_is_held_changes_nothing(
     scenes: tuple[Scene, Scene],
 ) -> None:
