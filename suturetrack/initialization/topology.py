@@ -266,6 +266,8 @@ def _open_rings(partner: dict[int, int], price: dict[tuple[int, int], float]) ->
         if added < 2 * FREE_END:
             for one, other in ((i, a), (j, b)):
                 partner[one], partner[other] = other, one
+                price.setdefault((one, other), 2 * FREE_END)
+                price.setdefault((other, one), 2 * FREE_END)
 
 
 def _ends_from(start: int, partner: dict[int, int]) -> list[int]:
