@@ -233,7 +233,7 @@ def test_threads_of_any_shape_are_found_whole_from_far_away() -> None:
         field = field_of(draw(left, rig, width=1), draw(right, rig, width=1), rig)
         found = initialize(field, rig, Seed(pixel=tuple(left[750])))
         errors.append(curve_error(dense(found.curve, 600), truth))
-    assert max(error.mean for error in errors) < 0.07
+    assert max(error.mean for error in errors) < 0.1
     assert max(abs(error.length_percent) for error in errors) < 5
 
 

@@ -192,7 +192,7 @@ def test_a_stretch_keeps_its_depth_while_it_runs_along_an_epipolar_line(
         for state, points in zip(states, truths, strict=True)
         if state.curve is not None
     ]
-    assert max(off) < 0.7
+    assert max(off) < 0.65
 
 
 def test_a_straight_thread_is_not_called_tracking_while_no_depth_of_it_is_told(
@@ -633,12 +633,12 @@ def test_a_thread_is_followed_in_the_field_of_its_own(rig: StereoRig) -> None:
 
 
 def test_an_end_beneath_another_thread_is_no_shorter(rig: StereoRig) -> None:
-    """Its own field shows nothing where the other one lies over it, on less than a twentieth."""
+    """Its own field shows nothing where the other thread lies over it."""
     x = np.linspace(-25, 25, 400)
     below = np.c_[x, 0.02 * x**2, np.full(400, 200.0)]
     tracker, lengths = Tracker(rig), []
     for i in range(90):
-        above = np.c_[np.full(400, max(45.0 - i, 24.5)), x + 12.0, np.full(400, 198.0)]
+        above = np.c_[np.full(400, max(45.0 - i, 24.0)), x + 12.0, np.full(400, 198.0)]
         above[:, 0] += 0.1 * x
         hidden = np.linalg.norm(below[:, None, :2] - above[::4, :2], axis=2).min(axis=1) < 0.6
         field = paint(rig, [below, above], i)

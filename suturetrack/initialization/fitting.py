@@ -49,8 +49,8 @@ def refine(
     fit = start.improved(views, rig, _DENSE_ROUNDS)
     if abs(fit.slip_px) > max(_OFF_PX, _SURELY * fit.slip_sigma_px):
         fit = replace(fit, is_level=False).improved(views, rig, _DENSE_ROUNDS)
-    few = with_needed_knots(fit.curve, fit.samples(views, rig), fit.stiffness)
-    fit = replace(fit, curve=few).improved(views, rig, _FINAL_ROUNDS)
+    fit = replace(fit, curve=with_needed_knots(fit.samples(views, rig)))
+    fit = fit.improved(views, rig, _FINAL_ROUNDS)
     samples = fit.samples(views, rig)
     return fit.curve, samples, deviations(fit.curve, samples, fit.stiffness), fit.rows
 

@@ -12,13 +12,13 @@ from suturetrack.kernels import spline
 from suturetrack.types import Float64, Nurbs
 
 _LEAST_SAMPLES = 3
-_SIGNIFICANT = 12.0
+_SIGNIFICANT = 25.0
 """Growth of a span's misfit, in units of the noise, that calls for a knot; four more unknowns grow
 with it, and neighbouring samples err alike."""
 _RIDGE = 1e-9
-
-Term = tuple[int, Float64, Float64]
-"""The order of a derivative, (k, 3, 3) how much it matters at each of k parameters, and (k, 3) its values."""
+_STAY_DEEP = 3e-5
+"""Weight, against that of a crest, of no weight where the crests tell, which keeps the disparity of
+samples where they do not."""
 
 
 def image_parameters(left: Float64, right: Float64) -> Float64:
@@ -31,36 +31,25 @@ def image_parameters(left: Float64, right: Float64) -> Float64:
 def fit_marks(points: Float64, s: Float64, spans: int) -> Nurbs:
     """Least-squares curve through (k, 3) stereo points at parameters `s` (end of Section V)."""
     knots = nurbs.clamped_knots(np.linspace(0, 1, spans + 1)[1:-1], spline.DEGREE)
-    return _closest(knots, s, ((0, np.tile(np.eye(3), (len(s), 1, 1)), points),))
+    return _closest(knots, s, points, np.tile(np.eye(3), (len(s), 1, 1)))
 
 
-def with_needed_knots(curve: Nurbs, samples: Samples, stiffness: Float64) -> Nurbs:
-    """The curve with as few knots as the crests allow.
+def with_needed_knots(samples: Samples) -> Nurbs:
+    """A curve through the samples with as few knots as the crests allow.
 
-    Spans are halved, by misfit, until none fits the crests significantly worse than `curve` does.
-    Where the crests say nothing, such as of the depth of an end along an epipolar line, its ends and
-    its bends are kept.
-
-    Args:
-        curve: with knots enough.
-        samples: of the curve.
-        stiffness: (2,) what holds back its bending across the line of sight, and that in disparity.
+    Spans are halved, by misfit, until none fits the crests significantly worse than the samples do.
+    An end along an epipolar line has the depth of the samples: the crests say nothing of it.
     """
-    first, table = spline.local_basis(samples.s, curve.knots)
-    second = spline.combine(first, table[2], curve.control_points)
-    across, deep = samples.bending_information(second)
-    places = samples.crest_information() + samples.rest_information()
-    places[[0, -1]] += samples.end_equations()[0]
-    terms = (
-        (0, places / samples.variance, samples.points),
-        (2, stiffness[0] * across + stiffness[1] * deep, second),
-    )
+    disparity = samples.image_axes[:, 2:]
+    deep = _STAY_DEEP * np.einsum("kij,kil->kjl", disparity, disparity)
+    places = samples.crest_information() + samples.rest_information() + deep
     interior = np.array([0.5])
     while True:
-        few = _closest(nurbs.clamped_knots(interior, spline.DEGREE), samples.s, terms)
-        new = _splits(samples.s, _excess(few, samples) / samples.variance, interior)
+        knots = nurbs.clamped_knots(interior, spline.DEGREE)
+        curve = _closest(knots, samples.s, samples.points, places)
+        new = _splits(samples.s, _excess(curve, samples) / samples.variance, interior)
         if not new:
-            return few
+            return curve
         interior = np.sort(np.r_[interior, new])
 
 
@@ -87,14 +76,13 @@ def _splits(s: Float64, excess: Float64, interior: Float64) -> list[float]:
     return new
 
 
-def _closest(knots: Float64, s: Float64, terms: tuple[Term, ...]) -> Nurbs:
-    """The curve whose derivatives are closest to the terms at the (k,) parameters `s`."""
+def _closest(knots: Float64, s: Float64, points: Float64, information: Float64) -> Nurbs:
+    """The curve closest to (k, 3) points where (k, 3, 3) `information` says that it matters."""
     first, table = spline.local_basis(s, knots)
     count = len(knots) - spline.DEGREE - 1
     band, gradient = np.zeros((3 * count, spline.BANDWIDTH)), np.zeros(3 * count)
-    for order, information, values in terms:
-        pull = np.einsum("kij,kj->ki", information, values)
-        spline.add_rows(first, table[order], information, pull, band, gradient)
+    pull = np.einsum("kij,kj->ki", information, points)
+    spline.add_rows(first, table[0], information, pull, band, gradient)
     band[:, 0] *= 1 + _RIDGE
     if not spline.factorize(band):
         raise FloatingPointError("the samples do not hold the curve")
