@@ -6,6 +6,8 @@ whose seed taught nothing, such as in the first, dark pictures of a camera, is l
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from services.bus import Reader
@@ -13,12 +15,12 @@ from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.segmentation import Segmenter
-from suturetrack.types import Seed, Status, StereoFrame, ThreadState
+from suturetrack.types import InputError, Seed, Status, StereoFrame, ThreadState
 
 _PERIOD_NS = 1_000_000_000
 """Of capture time, so that a recording adapts as the live run did."""
 _SOON_NS = 250_000_000
-"""And the period while there is a seeded thread of which nothing was learned yet."""
+"""And the first period while there is a seeded thread of which nothing was learned yet."""
 _SEEN = 0.9
 """Share of a curve that has to be seen for its thread to be learned."""
 _LONGEST_WAIT_S = 2.0
@@ -38,6 +40,8 @@ class Adaptation:
     ):
         self._segmenter, self._rig, self._states = segmenter, rig, states
         self._patience = _LONGEST_WAIT_S if lockstep else 0.0
+        self._pause_ns = _SOON_NS
+        """Until the next look at threads of which nothing was learned yet."""
         self._sample: StereoFrame | None = None
         self._awaited: set[str] = set()
         self._arrived: list[ThreadState] = []
@@ -48,7 +52,7 @@ class Adaptation:
             self._arrived.append(state)
         sample = self._sample
         is_learned = self._segmenter.seeded <= set(self._segmenter.threads)
-        period = _PERIOD_NS if is_learned else _SOON_NS
+        period = _PERIOD_NS if is_learned else self._pause_ns
         age = period if sample is None else frame.stamp.capture_ns - sample.stamp.capture_ns
         if 0 <= age < period:
             return
@@ -72,13 +76,21 @@ class Adaptation:
                 continue
             if thread in self._segmenter.seeded - set(self._segmenter.threads):
                 if state.status is not Status.LOST and np.mean(state.seen) > _SEEN:
-                    self._segmenter.learn(sample, seed_on(state))
+                    self._learn_first(sample, state)
             elif state.status is Status.TRACKING:
                 shown = np.linspace(0, 1, len(state.seen))[state.seen]
                 pixels = self._rig.project_raw(nurbs.evaluate(state.curve, shown))[0]
                 self._segmenter.adapt(sample, pixels, thread)
             elif all_lost:
                 self._segmenter.fade(thread)
+
+    def _learn_first(self, sample: StereoFrame, state: ThreadState) -> None:
+        """Learns a thread at last; what teaches nothing is tried less and less often, for it takes long."""
+        # Who says that a curve is seen may be wrong: it may lie outside the picture.
+        with suppress(InputError):
+            self._segmenter.learn(sample, seed_on(state))
+        has_learned = state.thread in self._segmenter.threads
+        self._pause_ns = _SOON_NS if has_learned else min(2 * self._pause_ns, _PERIOD_NS)
 
     def _of(self, frame: StereoFrame) -> dict[str, ThreadState]:
         return {state.thread: state for state in self._arrived if state.stamp == frame.stamp}

@@ -117,6 +117,20 @@ def test_a_thread_that_the_seed_did_not_show_is_learned_once_it_is_seen(
     assert len(set(desk.fields)) == 2
 
 
+def test_what_is_said_to_be_seen_outside_the_picture_teaches_nothing(
+    scenes: tuple[Scene, Scene],
+) -> None:
+    desk = Desk(scenes)
+    desk.segmenter.forget("0")
+    black = np.zeros_like(desk.images[0])
+    seed = Seed(pixel=scenes[0].seed_pixel())
+    desk.segmenter.learn(StereoFrame(Stamp(0, 0, 0), black, black), seed)
+    away = replace(desk.curve, control_points=desk.curve.control_points + [1000.0, 0.0, 0.0])
+    for index in range(4):
+        desk.frame(index, state_of(away, Stamp(index, 0, 0)))
+    assert not desk.segmenter.threads
+
+
 def test_a_lost_thread_beside_one_that_is_held_changes_nothing(
     scenes: tuple[Scene, Scene],
 ) -> None:
