@@ -125,7 +125,9 @@ def test_what_is_said_to_be_seen_outside_the_picture_teaches_nothing(
     black = np.zeros_like(desk.images[0])
     seed = Seed(pixel=scenes[0].seed_pixel())
     desk.segmenter.learn(StereoFrame(Stamp(0, 0, 0), black, black), seed)
-    away = replace(desk.curve, control_points=desk.curve.control_points + [1000.0, 0.0, 0.0])
+    away = replace(
+        desk.curve, control_points=desk.curve.control_points + np.array([1000.0, 0.0, 0.0])
+    )
     for index in range(4):
         desk.frame(index, state_of(away, Stamp(index, 0, 0)))
     assert not desk.segmenter.threads
