@@ -51,15 +51,14 @@ class Adaptation:
         while (state := self._states.get(0)) is not None:
             self._arrived.append(state)
         sample = self._sample
-        is_learned = self._segmenter.seeded <= set(self._segmenter.threads)
-        period = _PERIOD_NS if is_learned else self._pause_ns
+        period = self._pause_ns if self._segmenter.unlearned else _PERIOD_NS
         age = period if sample is None else frame.stamp.capture_ns - sample.stamp.capture_ns
         if 0 <= age < period:
             return
         if sample is not None and age > 0:
             self._learn(sample)
         self._sample = frame
-        self._awaited = set(self._segmenter.seeded)
+        self._awaited = {*self._segmenter.threads, *self._segmenter.unlearned}
         self._arrived = list(self._of(frame).values())
 
     def _learn(self, sample: StereoFrame) -> None:
@@ -74,7 +73,7 @@ class Adaptation:
             state = scaled(message, 1 / self._rig.metres_per_unit)
             if state.curve is None:
                 continue
-            if thread in self._segmenter.seeded - set(self._segmenter.threads):
+            if thread in self._segmenter.unlearned:
                 if state.status is not Status.LOST and np.mean(state.seen) > _SEEN:
                     self._learn_first(sample, state)
             elif state.status is Status.TRACKING:
@@ -89,8 +88,8 @@ class Adaptation:
         # Who says that a curve is seen may be wrong: it may lie outside the picture.
         with suppress(InputError):
             self._segmenter.learn(sample, seed_on(state))
-        has_learned = state.thread in self._segmenter.threads
-        self._pause_ns = _SOON_NS if has_learned else min(2 * self._pause_ns, _PERIOD_NS)
+        in_vain = state.thread in self._segmenter.unlearned
+        self._pause_ns = min(2 * self._pause_ns, _PERIOD_NS) if in_vain else _SOON_NS
 
     def _of(self, frame: StereoFrame) -> dict[str, ThreadState]:
         return {state.thread: state for state in self._arrived if state.stamp == frame.stamp}

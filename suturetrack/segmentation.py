@@ -119,9 +119,9 @@ class Segmenter:
         return tuple(self._threads)
 
     @property
-    def seeded(self) -> frozenset[str]:
-        """Names of the threads that were to be learned, whether their seeds taught anything or not."""
-        return frozenset(self._seeded)
+    def unlearned(self) -> frozenset[str]:
+        """Names of the threads whose seeds have taught nothing."""
+        return frozenset(self._seeded - self._threads.keys())
 
     def step(self, frame: StereoFrame) -> RidgeField:
         """The field of `frame`, in rectified pixels.

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from suturetrack.initialization.paths import follow
 from suturetrack.initialization.pricing import FREE_END, TOUCHING_PX
 from suturetrack.initialization.segments import ARM, Ridges, chain_tangents
-from suturetrack.initialization.topology import Merged, follow, swap, within_reach
+from suturetrack.initialization.topology import Merged, swap, within_reach
 from suturetrack.types import Float64
 
 Doubt = tuple[Float64, str, float]

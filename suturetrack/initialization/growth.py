@@ -11,8 +11,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.doubts import FADES, Doubt, doubts
 from suturetrack.initialization.model import InitializationConfig, ViewGrowth
+from suturetrack.initialization.paths import follow
 from suturetrack.initialization.segments import Ridges
-from suturetrack.initialization.topology import follow, merge_ends
+from suturetrack.initialization.topology import merge_ends
 from suturetrack.kernels import growth as kernel
 from suturetrack.types import Bool, Float32, Float64
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from suturetrack.initialization.paths import other_end
 from suturetrack.initialization.pricing import FREE_END
 from suturetrack.types import Float64
 
@@ -59,11 +60,3 @@ def _double(
     for i, j in ((tip, back ^ 1), (back, waiting)):
         partner[i], partner[j] = j, i
     price[tip, back ^ 1] = price[back ^ 1, tip] = 2 * FREE_END
-
-
-def other_end(end: int, partner: dict[int, int]) -> int:
-    """The free end at the other side of the chain of segments that begins at the free `end`."""
-    end ^= 1
-    while end in partner:
-        end = partner[end] ^ 1
-    return end

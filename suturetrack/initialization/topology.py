@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from suturetrack.initialization.depth import Depth
-from suturetrack.initialization.hairpins import double_stubs, other_end
+from suturetrack.initialization.hairpins import double_stubs
 from suturetrack.initialization.model import InitializationConfig
+from suturetrack.initialization.paths import is_ring, other_end, ring_from
 from suturetrack.initialization.pricing import FREE_END, Merge, price_merges
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.initialization.strands import REACH, Strands
@@ -226,7 +227,7 @@ def _double(
     start, stop = run[0], run[-1] ^ 1
     first, last = partner[start], partner[stop]
     # Of the two ways to connect the strands none may close a loop; else the smoother one is taken.
-    ring = other_end(one, partner) == other or _is_ring(start, partner)
+    ring = other_end(one, partner) == other or is_ring(start, partner)
     if ring or other == other_end(first, partner) or one == other_end(last, partner):
         swap = ring
     else:
@@ -253,9 +254,9 @@ def _double(
 def _open_rings(partner: dict[int, int], price: dict[tuple[int, int], float]) -> None:
     """Leads a strand that crosses a ring of segments through it: a thread has two ends."""
     for start in list(partner):
-        if not _is_ring(start, partner):
+        if not is_ring(start, partner):
             continue
-        ring = _ends_from(start, partner)
+        ring = ring_from(start, partner)
         ways = [
             (price[i, a] + price.get((j, b), 2.0) - price[i, j] - price[a, b], i, j, a, b)
             for i, j in ((e, partner[e]) for e in ring)
@@ -268,39 +269,6 @@ def _open_rings(partner: dict[int, int], price: dict[tuple[int, int], float]) ->
                 partner[one], partner[other] = other, one
                 price.setdefault((one, other), 2 * FREE_END)
                 price.setdefault((other, one), 2 * FREE_END)
-
-
-def _ends_from(start: int, partner: dict[int, int]) -> list[int]:
-    """The ends, two a segment, of the ring that leads through the end `start`."""
-    ends = [start, start ^ 1]
-    while partner[ends[-1]] != start:
-        ends += [partner[ends[-1]], partner[ends[-1]] ^ 1]
-    return ends
-
-
-def _is_ring(start: int, partner: dict[int, int]) -> bool:
-    """Whether the segments joined to that of the end `start` lead back to it."""
-    end = start ^ 1
-    while end in partner:
-        end = partner[end] ^ 1
-        if end == start ^ 1:
-            return True
-    return False
-
-
-def follow(start: int, partner: dict[int, int]) -> list[int]:
-    """The ends at which the segments of a thread are entered, in order, from one of its ends to the
-    other; `start` is a segment on it."""
-    entry = 2 * start
-    seen = {start}
-    while entry in partner and partner[entry] // 2 not in seen:
-        entry = partner[entry] ^ 1
-        seen.add(entry // 2)
-    entries, seen = [entry], {entry // 2}
-    while (leave := entries[-1] ^ 1) in partner and partner[leave] // 2 not in seen:
-        entries.append(partner[leave])
-        seen.add(entries[-1] // 2)
-    return entries
 
 
 def _pair(partner: dict[int, int], pairs: Int64) -> None:
