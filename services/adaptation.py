@@ -1,4 +1,4 @@
-"""What the tracker holds shows the segmenter, once a second, how the threads look by now.
+"""What the tracker holds shows the segmenter how the threads move and, once a second, how they look by now.
 
 Where all of them are lost they may have faded: they are looked for as if they stood out less and less. One
 whose seed taught nothing, such as in the first, dark pictures of a camera, is learned where it is seen.
@@ -23,6 +23,7 @@ _SOON_NS = 250_000_000
 """And the first period while there is a seeded thread of which nothing was learned yet."""
 _SEEN = 0.9
 """Share of a curve that has to be seen for its thread to be learned."""
+_ALONG = np.linspace(0, 1, 64)
 _LONGEST_WAIT_S = 2.0
 """Lock-step: for states that are on their way."""
 
@@ -46,10 +47,14 @@ class Adaptation:
         self._awaited: set[str] = set()
         self._arrived: list[ThreadState] = []
 
+    def catch_up(self) -> None:
+        """To be called before a frame is segmented: takes in the states that have come."""
+        while (state := self._states.get(0)) is not None:
+            self._take_in(state)
+
     def step(self, frame: StereoFrame) -> None:
         """To be called once for every frame that was segmented, after its field was published."""
-        while (state := self._states.get(0)) is not None:
-            self._arrived.append(state)
+        self.catch_up()
         sample = self._sample
         period = self._pause_ns if self._segmenter.unlearned else _PERIOD_NS
         age = period if sample is None else frame.stamp.capture_ns - sample.stamp.capture_ns
@@ -66,7 +71,7 @@ class Adaptation:
             state = self._states.get(self._patience)
             if state is None:
                 break
-            self._arrived.append(state)
+            self._take_in(state)
         states = self._of(sample)
         all_lost = all(state.status is Status.LOST for state in states.values())
         for thread, message in sorted(states.items()):
@@ -83,6 +88,10 @@ class Adaptation:
             elif all_lost:
                 self._segmenter.fade(thread)
 
+    def _take_in(self, state: ThreadState) -> None:
+        self._arrived.append(state)
+        follow(self._segmenter, scaled(state, 1 / self._rig.metres_per_unit))
+
     def _learn_first(self, sample: StereoFrame, state: ThreadState) -> None:
         """Learns a thread at last; what teaches nothing is tried less and less often, for it takes long."""
         # Who says that a curve is seen may be wrong: it may lie outside the picture.
@@ -93,6 +102,13 @@ class Adaptation:
 
     def _of(self, frame: StereoFrame) -> dict[str, ThreadState]:
         return {state.thread: state for state in self._arrived if state.stamp == frame.stamp}
+
+
+def follow(segmenter: Segmenter, state: ThreadState) -> None:
+    """Tells the segmenter where a thread that is held was; lengths in the calibration's unit."""
+    if state.curve is not None and state.status is not Status.LOST:
+        points = nurbs.evaluate(state.curve, _ALONG)
+        segmenter.follow(state.stamp.capture_ns, points, state.thread)
 
 
 def seed_on(state: ThreadState) -> Seed:

@@ -77,6 +77,7 @@ def run(service: Service, config: SegmenterConfig) -> None:
             while (seed := seedings.get(0)) is not None:
                 segmenter.learn(frame, scaled(seed, 1 / rig.metres_per_unit))
                 recorder.request(frame.stamp, seed)
+            adaptation.catch_up()
             ridges = segmenter.step(frame)
         except InputError as error:
             frames.refuse(str(error))

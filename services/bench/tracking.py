@@ -17,6 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from services.adaptation import follow
 from services.bench import report
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
@@ -206,7 +207,8 @@ def run(config: TrackingBench, console: Console) -> list[Row]:
 def run_case(case: Case) -> list[Row]:
     """Tracks the scene's threads from one seed pixel each in the first frame.
 
-    A row a method and thread; all methods work on the same fields.
+    A row a method and thread; all methods work on the same fields, in which the threads are looked for
+    where the first method says that they move.
     """
     cv2.setNumThreads(1)
     scene = open_scene(case.scenario, case.seed, case.rig, case.fps, case.picture)
@@ -233,6 +235,8 @@ def run_case(case: Case) -> list[Row]:
             began = time.perf_counter()
             states = {state.thread: state for state in tracker.step(seen).states}
             elapsed = 1000 * (time.perf_counter() - began)
+            for state in states.values() if method == case.methods[0] else ():
+                follow(segmenter, state)
             for name, truth in truths.items():
                 result = score(states[name], truth, scene.rig, limits[name], elapsed)
                 scores[method, name].append(result)

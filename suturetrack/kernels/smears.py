@@ -1,0 +1,56 @@
+"""Smeared threads, out of a field of half the size, into the field."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from suturetrack.types import Float32, Image
+
+_fast = {"fastmath": {"contract", "nnan", "ninf", "nsz", "arcp"}, "error_model": "numpy"}
+_zero, _half, _one = np.float32(0), np.float32(0.5), np.float32(1)
+# Shares of the longest vector of a smear from which a vector fades and at which it is gone.
+_FADES, _GONE = 1.2, 1.8
+
+
+@njit(cache=True, **_fast)
+def keep_longer_of_half(half: Float32, mask: Image, longest: float, out: Float32) -> None:
+    """Within the mask, the longer of both fields' vectors into `out`.
+
+    Args:
+        half: (ceil(H / 2), ceil(W / 2), 2), read linearly between the vectors' places; their signs mean
+            nothing.
+        mask: (H, W), 0 where `out` stays as it is.
+        longest: length of the longest vector in `half` that a smeared thread has: what is longer is
+            something darker, such as a tool.
+        out: (H, W, 2), overwritten.
+    """
+    height, width = out.shape[:2]
+    rows, columns = half.shape[:2]
+    gone, fading = np.float32(_GONE * longest), np.float32((_GONE - _FADES) * longest)
+    for y in range(height):
+        v = (np.float32(y) + _half) * np.float32(rows / height) - _half
+        top = math.floor(v)
+        down = v - np.float32(top)
+        above, below = max(top, 0), min(top + 1, rows - 1)
+        for x in range(width):
+            if mask[y, x] == 0:
+                continue
+            u = (np.float32(x) + _half) * np.float32(columns / width) - _half
+            before = math.floor(u)
+            right = u - np.float32(before)
+            left, after = max(before, 0), min(before + 1, columns - 1)
+            nearest = half[above if down < _half else below, left if right < _half else after]
+            p = q = _zero
+            for row, by_row in ((above, _one - down), (below, down)):
+                for column, by_column in ((left, _one - right), (after, right)):
+                    vector, share = half[row, column], by_row * by_column
+                    if vector[0] * nearest[0] + vector[1] * nearest[1] < _zero:
+                        share = -share
+                    p, q = p + share * vector[0], q + share * vector[1]
+            kept = min(max((gone - np.sqrt(p * p + q * q)) / fading, _zero), _one)
+            p, q = kept * p, kept * q
+            if p * p + q * q > out[y, x, 0] * out[y, x, 0] + out[y, x, 1] * out[y, x, 1]:
+                out[y, x, 0], out[y, x, 1] = p, q

@@ -1,0 +1,237 @@
+"""From a stereo pair to the ridge vector field: eq. (1) and Algorithm 1 (Section III)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.contrast import SIGMAS, Contrast, contrast_along, contrast_at
+from suturetrack.kernels import ridge
+from suturetrack.segmentation.config import SegmentationConfig
+from suturetrack.segmentation.sight import SLOTS, Pair, Sight, first_look, learned_look
+from suturetrack.segmentation.smear import Course
+from suturetrack.silhouette import is_cut_out, silhouette_scale, silhouettes
+from suturetrack.types import (
+    Float32,
+    Float64,
+    InputError,
+    RidgeField,
+    Seed,
+    Stamp,
+    StereoFrame,
+)
+
+# Share of the way that a learned contrast goes at each step.
+_ADAPT = 0.2
+# What is left at each step of the contrast of a thread that stays lost.
+_FADE = 0.5
+# Fewest pixels of a curve from which contrast is learned.
+_FEWEST_PIXELS = 8
+
+
+class Segmenter:
+    """Turns stereo frames into ridge vector fields.
+
+    Each learned thread is looked for in a field of its own; of several, the longest vectors make the
+    field of all. Where a thread is known to move fast and does not show, it is looked for as a smear.
+    The buffers of a field are used again four steps later; who keeps a field longer copies it.
+    """
+
+    def __init__(self, rig: StereoRig, config: SegmentationConfig = SegmentationConfig()) -> None:
+        self._rig = rig
+        self._config = config
+        self._threads: dict[str, Contrast] = {}
+        self._clear: dict[str, Contrast] = {}
+        """As they were when they were seen last."""
+        self._seeded: set[str] = set()
+        self._first = Sight(rig, config, first_look(config))
+        self._sights: dict[str, Sight] = {}
+        self._courses: dict[str, Course] = {}
+        self._all: Float32 | None = None
+        self._steps = 0
+        self._is_cut_out = False
+
+    @property
+    def threads(self) -> tuple[str, ...]:
+        """Names of the threads that were learned."""
+        return tuple(self._threads)
+
+    @property
+    def unlearned(self) -> frozenset[str]:
+        """Names of the threads whose seeds have taught nothing."""
+        return frozenset(self._seeded - self._threads.keys())
+
+    def step(self, frame: StereoFrame) -> RidgeField:
+        """The field of `frame`, in rectified pixels.
+
+        Raises:
+            InputError: the images are not uint8, gray or BGR, of the rig's size, and alike.
+        """
+        self._check(frame)
+        frame = self._seen(frame)
+        slot = self._steps % SLOTS
+        self._steps += 1
+        now_ns = frame.stamp.capture_ns
+        own = {
+            name: sight.step(frame, slot, self._courses[name].bands(now_ns, self._rig))
+            for name, sight in self._sights.items()
+        }
+        if len(own) > 1:
+            return joined(frame.stamp, own, self._room_for_all(slot))
+        return RidgeField(
+            frame.stamp, *(own.popitem()[1] if own else self._first.step(frame, slot))
+        )
+
+    def learn(self, frame: StereoFrame, seed: Seed) -> None:
+        """Learn at `seed` what tells its thread from the surroundings: colours, width, contrast.
+
+        A seed with no ridge within 8 px teaches nothing. Where the thread was cut out of its picture,
+        only its outline counts from then on.
+
+        Raises:
+            InputError: as `step`, or the seed lies outside the left image.
+        """
+        self._check(frame)
+        own = self._config.channel == "learned" and self._config.polarity == "auto"
+        self._is_cut_out = own and is_cut_out(frame)
+        frame = self._seen(frame)
+        image = self._rig.rectify(frame.left, frame.right)[0]
+        pixel = self._locate(seed)
+        contrast = contrast_at(image, pixel)
+        self._seeded.add(seed.thread)
+        if contrast is not None:
+            if self._is_cut_out:
+                contrast = replace(contrast, sigma=max(silhouette_scale(frame.left), SIGMAS[0]))
+            self._clear[seed.thread] = contrast
+            self._look_for(seed.thread, contrast)
+
+    def forget(self, thread: str) -> None:
+        """Look for a thread no more; without any, look as before the first was learned."""
+        self._seeded.discard(thread)
+        if self._threads.pop(thread, None) is not None:
+            del self._clear[thread], self._sights[thread], self._courses[thread]
+            self._is_cut_out &= bool(self._threads)
+
+    def adapt(self, frame: StereoFrame, pixels: Float64, thread: str = "0") -> None:
+        """Follow slow changes of the light: go a part of the way to what a held curve shows.
+
+        Args:
+            frame: the frame that the curve belongs to.
+            pixels: (N, 2) raw left pixels along the curve, where the thread is seen.
+            thread: which thread this is; one that was never learned is left alone, and every one
+            where the configuration says so.
+
+        Raises:
+            InputError: as `step`.
+        """
+        self._check(frame)
+        frame = self._seen(frame)
+        width, height = self._rig.image_size
+        inside = (pixels >= 0).all(1) & (pixels <= (width - 1, height - 1)).all(1)
+        learned = self._config.adapt and thread in self._threads
+        if not learned or np.count_nonzero(inside) < _FEWEST_PIXELS:
+            return
+        old, clear = self._threads[thread], self._clear[thread]
+        seen = contrast_along(frame.left, pixels[inside], old.sigma)
+        # What was lost may be as clear as before, or as faint as it was found again.
+        nearer = min(old, clear, key=lambda contrast: abs(contrast.strength - seen.strength))
+        followed = nearer.follow(seen, _ADAPT)
+        if followed is not nearer:
+            self._clear[thread] = followed
+            self._look_for(thread, followed)
+
+    def follow(self, capture_ns: int, points: Float64, thread: str = "0") -> None:
+        """Know where a thread was, and so how fast it moves.
+
+        Args:
+            capture_ns: when.
+            points: (k, 3) evenly along its curve, rectified left frame, calibration's unit; always as many.
+            thread: which thread this is; one that was never learned is left alone.
+        """
+        if thread in self._courses:
+            self._courses[thread].learn(capture_ns, points)
+
+    def fade(self, thread: str = "0") -> None:
+        """Look for a thread that is lost as if it stood out less than before, down to a quarter of what
+        it did when it was seen last.
+
+        Focus, smoke or light may have changed at once, when no curve is held that could show it.
+        """
+        if not self._config.adapt or thread not in self._threads:
+            return
+        self._look_for(thread, self._threads[thread].fainter(_FADE, self._clear[thread]))
+
+    def warm_up(self) -> None:
+        """Compile (or load) the kernels, so that the first frame is as quick as the next."""
+        width, height = self._rig.image_size
+        # Learned, so that rims fade as well.
+        sight = Sight(self._rig, self._config, replace(self._first.look, relative=True))
+        for shape in ((height, width, 3), (height, width)):
+            black = np.zeros(shape, np.uint8)
+            field = sight.step(StereoFrame(Stamp(0, 0, 0), black, black), 0)
+            ridge.keep_longer(field[0], field[1])
+
+    def _check(self, frame: StereoFrame) -> None:
+        width, height = self._rig.image_size
+        for name, image in (("left", frame.left), ("right", frame.right)):
+            if image.dtype != np.uint8:
+                raise InputError(f"{name} image: {image.dtype} pixels; 8-bit pixels are expected")
+            if image.shape[:2] != (height, width) or image.shape[2:] not in ((), (3,)):
+                raise InputError(
+                    f"{name} image: shape {image.shape}; ({height}, {width}) gray or "
+                    f"({height}, {width}, 3) BGR fits the calibration"
+                )
+        if frame.left.ndim != frame.right.ndim:
+            raise InputError("one image is gray and the other in colour; both must be alike")
+
+    def _seen(self, frame: StereoFrame) -> StereoFrame:
+        return silhouettes(frame) if self._is_cut_out else frame
+
+    def _locate(self, seed: Seed) -> tuple[float, float]:
+        if seed.pixel is not None:
+            u, v = self._rig.rectify_pixels(np.array(seed.pixel, float))
+        else:
+            u, v = self._rig.project(np.array(seed.point, float))[0]
+        width, height = self._rig.image_size
+        if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+            raise InputError(
+                f"seed at ({u:.0f}, {v:.0f}) px: outside the left image of {width}x{height}"
+            )
+        return float(u), float(v)
+
+    def _look_for(self, thread: str, contrast: Contrast) -> None:
+        self._threads[thread] = contrast
+        look = learned_look(self._config, contrast)
+        if thread in self._sights:
+            self._sights[thread].look = look
+        else:
+            self._sights[thread] = Sight(self._rig, self._config, look)
+            self._courses[thread] = Course()
+
+    def _room_for_all(self, slot: int) -> Pair:
+        width, height = self._rig.image_size
+        if self._all is None:
+            self._all = np.empty((SLOTS, 2, height, width, 2), np.float32)
+        left, right = self._all[slot]
+        return left, right
+
+
+def joined(stamp: Stamp, own: Mapping[str, Pair], out: Pair | None = None) -> RidgeField:
+    """The field of several threads: at each pixel the longest of their vectors.
+
+    Args:
+        stamp: of the frame.
+        own: by thread, left and right, (H, W, 2) float32 each.
+        out: where to put left and right; without it, new arrays that nobody may write to.
+    """
+    first, *others = own.values()
+    left, right = out or (np.empty_like(first[0]), np.empty_like(first[1]))
+    for side, longest in enumerate((left, right)):
+        np.copyto(longest, first[side])
+        for other in others:
+            ridge.keep_longer(other[side], longest)
+        longest.flags.writeable = out is not None
+    return RidgeField(stamp, left, right, own)

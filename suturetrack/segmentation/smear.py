@@ -1,0 +1,118 @@
+"""Threads that move fast: the exposure smears them until the filter's scale does not see them.
+
+Where a held thread moves fast, and the field shows nothing along it, it is looked for at wider scales.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from suturetrack.camera import StereoRig
+from suturetrack.types import Bool, Float32, Float64, Image
+
+# Curves count once they are so old, lest a field depend on how fast they came, and until they are so old;
+# where the last of them is older, nobody knows where the thread is by now.
+_YOUNGEST_NS, _OLDEST_NS, _LATEST_NS = 50_000_000, 450_000_000, 250_000_000
+_MOST = 64
+# How far from where it is going a thread is looked for: so many times its step and so many px more.
+_STEPS, _BESIDE_PX, _FURTHEST_PX = 2.0, 6.0, 40.0
+_PLACES_ACROSS = np.linspace(-1, 1, 61)
+# Vectors shorter than this along the thread show nothing.
+_FAINT = 0.2
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A scale that is wider than the thread's own."""
+
+    times: int
+    """How much wider."""
+    from_px: float
+    """How far a thread has to move across itself between two frames to be looked for at this scale."""
+    longest: float
+    """Length of its vectors, at most: the wider a smear, the fainter. This is what is left of a thread as
+    wide as two sigmas, whose S is 2c, when this scale begins to see it better than half the scale does."""
+
+
+WIDER = Scale(2, 5.0, 0.576), Scale(4, 8.0, 0.193)
+
+
+class Course:
+    """Where a thread is going, by its last curves."""
+
+    def __init__(self) -> None:
+        self._curves: deque[tuple[int, Float64]] = deque(maxlen=_MOST)
+
+    def learn(self, capture_ns: int, points: Float64) -> None:
+        """Where the thread was: (k, 3) points spread evenly along it, always as many."""
+        if self._curves and capture_ns <= self._curves[-1][0]:
+            self._curves.clear()
+        self._curves.append((capture_ns, points))
+
+    def bands(self, now_ns: int, rig: StereoRig) -> tuple[Band, Band] | None:
+        """Where both views should show it; None where it is not known to move."""
+        known = [c for c in self._curves if _YOUNGEST_NS <= now_ns - c[0] <= _OLDEST_NS]
+        if len(known) < 2 or now_ns - known[-1][0] > _LATEST_NS:
+            return None
+        times = 1e-9 * np.array([t for t, _ in known])
+        points = np.array([p for _, p in known])
+        gaps = np.diff(times)
+        velocities = np.diff(points, axis=0) / gaps[:, None, None]
+        now = points[-1] + velocities[-1] * (1e-9 * now_ns - times[-1])
+        before = rig.project(now - velocities * gaps.min())
+        left, right = (
+            Band.of(pixels, last) for pixels, last in zip(rig.project(now), before, strict=True)
+        )
+        return left, right
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Where one view should show a thread, and how fast it moves there."""
+
+    pixels: Float64
+    """(k, 2) rectified px."""
+    tangents: Float64
+    """(k, 2) unit tangents."""
+    steps: Float64
+    """(k,) px by which it has moved across itself between two frames, at most, of late."""
+
+    @classmethod
+    def of(cls, pixels: Float64, before: Float64) -> Band:
+        """From (k, 2) pixels and (n, k, 2) where they were a frame before, at each of n velocities."""
+        along = np.gradient(pixels, axis=0)
+        tangents = along / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+        steps = np.abs(np.sum((pixels - before) * _turned(tangents), axis=2)).max(axis=0)
+        return cls(pixels, tangents, steps)
+
+    def is_empty(self, field: Float32) -> Bool:
+        """(k,) whether an (H, W, 2) field shows nothing along the thread within reach."""
+        height, width = field.shape[:2]
+        across = _turned(self.tangents)[:, None, :] * self._reach[:, None, None]
+        places = self.pixels[:, None, :] + across * _PLACES_ACROSS[:, None]
+        u, v = np.rint(places.clip(-1, (width, height))).astype(int).transpose(2, 0, 1)
+        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        vectors = field[v * inside, u * inside]
+        along = np.abs(np.sum(vectors * self.tangents[:, None, :], axis=2))
+        return np.asarray((along * inside).max(axis=1) < _FAINT)
+
+    def paint(self, which: Bool, mask: Image) -> None:
+        """Sets (H, W) `mask` within reach of the places that are meant, and elsewhere to 0."""
+        mask[:] = 0
+        bound = 4 * max(mask.shape)
+        ends = np.rint(self.pixels.clip(-bound, bound)).astype(int)
+        for i in np.flatnonzero(which):
+            piece = ends[max(i - 1, 0) : i + 2]
+            cv2.polylines(mask, [piece], False, 1, thickness=round(2 * self._reach[i]))
+
+    @property
+    def _reach(self) -> Float64:
+        return np.minimum(_STEPS * self.steps + _BESIDE_PX, _FURTHEST_PX)
+
+
+def _turned(vectors: Float64) -> Float64:
+    return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
