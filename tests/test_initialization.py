@@ -11,7 +11,11 @@ from scipy.stats import spearmanr
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
-from suturetrack.initialization.segments import split_at_touches
+from suturetrack.initialization.depth import Depth
+from suturetrack.initialization.model import InitializationConfig
+from suturetrack.initialization.segments import find_ridges, split_at_touches
+from suturetrack.initialization.strands import Strands
+from suturetrack.initialization.topology import merge_ends
 from suturetrack.metrics import curve_error, polyline_distances, polyline_length
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import Picture, Scene, open_scene
@@ -26,6 +30,7 @@ from suturetrack.types import (
     StereoFrame,
 )
 from tests.conftest import make_rig
+from tests.painting import paint
 
 STAMP = Stamp(0, 0, 0)
 
@@ -624,3 +629,32 @@ def test_an_end_that_the_views_cut_on_different_rows_does_not_fold(rig: StereoRi
     seed = Seed(pixel=tuple(left[700]))
     found = initialize(field_of(draw(left, rig), draw(cut, rig), rig), rig, seed)
     assert curve_error(dense(found.curve), truth).largest < 2
+
+
+def tangle(rng: np.random.Generator) -> Float64:
+    """(500, 3) points of a thread at random that crosses itself many times."""
+    count = int(rng.integers(10, 22))
+    places = rng.uniform(-1, 1, (count, 3)) * (36.0, 27.0, 4.8) + (-10.0, 0.0, 200.0)
+    knots = nurbs.clamped_knots(np.linspace(0, 1, count - 2)[1:-1], 3)
+    return nurbs.evaluate(nurbs.curve_from(3, knots, places), np.linspace(0, 1, 500))
+
+
+def test_strands_are_asked_of_no_copies_but_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that was doubled has a neighbour twice: the arms of another segment, or of none, used to stand
+    for its copy."""
+    rng, rig, asked = np.random.default_rng(61), make_rig(), []
+    threads = [tangle(rng) for _ in range(rng.integers(1, 4))]
+    field = paint(rig, threads, 0)
+    left, right = rig.project(threads[0])
+    ridges = find_ridges(field.left, InitializationConfig())
+    change = Strands.change
+
+    def spy(strands: Strands, *ways: list[tuple[int, int]]) -> float | None:
+        asked.extend(end for way in ways for pair in way for end in pair)
+        return change(strands, *ways)
+
+    monkeypatch.setattr(Strands, "change", spy)
+    depth = Depth.around((left - right)[:, 0], field.left, field.right)
+    merged = merge_ends(ridges, InitializationConfig(), depth)
+    assert len(merged.segments) > len(ridges.segments)
+    assert 0 < max(asked) < 2 * len(ridges.segments)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -95,9 +96,16 @@ def _bent(
 ) -> frozenset[int]:
     if strands is None:
         return frozenset()
-    origin = {id(s): k for k, s in enumerate(originals)}
-    ends = {e: 2 * origin[id(segments[e // 2])] + e % 2 for e in partner}
+    ends = {end: _original(end, originals, segments) for end in partner}
     return frozenset(i for i, j in partner.items() if strands.bend(ends[i], ends[j]) > _BENT)
+
+
+def _original(end: int, originals: Sequence[Float64], segments: Sequence[Float64]) -> int:
+    """The end that `end`, of `segments`, is or is a copy of: strands know of no copies but their own."""
+    if end // 2 < len(originals):
+        return end
+    copied = segments[end // 2]
+    return 2 * next(k for k, segment in enumerate(originals) if segment is copied) + end % 2
 
 
 def _bridge_hidden(
@@ -195,7 +203,7 @@ def _share(
         if any(e // 2 in taken for e in run):
             continue
         taken.update(e // 2 for e in run)
-        _double(run, one, other, copies, partner, price, strands)
+        _double(run, one, other, segments, copies, partner, price, strands)
     return tuple(copies)
 
 
@@ -218,6 +226,7 @@ def _double(
     run: list[int],
     one: int,
     other: int,
+    originals: tuple[Float64, ...],
     copies: list[Float64],
     partner: dict[int, int],
     price: dict[tuple[int, int], float],
@@ -232,7 +241,13 @@ def _double(
         swap = ring
     else:
         straight, crossed = [(one, other), (first, last)], [(one, last), (first, other)]
-        change = None if strands is None else strands.change(straight, crossed)
+        change = None
+        if strands is not None:
+            ways = (
+                [(_original(i, originals, copies), _original(j, originals, copies)) for i, j in way]
+                for way in (straight, crossed)
+            )
+            change = strands.change(*ways)
         if change is None:
             change = sum(price.get(p, 2.0) for p in crossed)
             change -= sum(price.get(p, 2.0) for p in straight)

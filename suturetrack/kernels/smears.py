@@ -22,9 +22,9 @@ def keep_longer_of_half(half: Float32, mask: Image, longest: float, out: Float32
     Args:
         half: (ceil(H / 2), ceil(W / 2), 2), read linearly between the vectors' places; their signs mean
             nothing.
-        mask: (H, W), 0 where `out` stays as it is.
-        longest: length of the longest vector in `half` that a smeared thread has: what is longer is
-            something darker, such as a tool.
+        mask: (H, W), 0 where `out` stays as it is; set to 0 where something is too dark for a smear.
+        longest: length of the longest vector in `half` that a smeared thread has; longer ones fade, and
+            what is much longer is something darker, such as a tool.
         out: (H, W, 2), overwritten.
     """
     height, width = out.shape[:2]
@@ -50,7 +50,11 @@ def keep_longer_of_half(half: Float32, mask: Image, longest: float, out: Float32
                     if vector[0] * nearest[0] + vector[1] * nearest[1] < _zero:
                         share = -share
                     p, q = p + share * vector[0], q + share * vector[1]
-            kept = min(max((gone - np.sqrt(p * p + q * q)) / fading, _zero), _one)
+            length = np.sqrt(p * p + q * q)
+            if length > gone:
+                mask[y, x] = 0
+                continue
+            kept = min(max((gone - length) / fading, _zero), _one)
             p, q = kept * p, kept * q
             if p * p + q * q > out[y, x, 0] * out[y, x, 0] + out[y, x, 1] * out[y, x, 1]:
                 out[y, x, 0], out[y, x, 1] = p, q

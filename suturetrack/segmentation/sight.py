@@ -12,7 +12,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.contrast import GRAY, SIGMAS, Contrast, channel_means
 from suturetrack.kernels import ridge, rims, smears
 from suturetrack.segmentation.config import SegmentationConfig
-from suturetrack.segmentation.smear import WIDER, Band
+from suturetrack.segmentation.smear import FAST_PX, WIDER, Band
 from suturetrack.types import Float32, Float64, Image, StereoFrame
 
 Pair = tuple[Float32, Float32]
@@ -31,6 +31,8 @@ SLOTS = 4
 _PULL = 0.1
 # How far from the middle of a thread its ground begins, in sigmas.
 _GROUND = 2.5
+# How far around it a vector depends on the image, in sigmas.
+_AROUND = 8.0
 # Least automatic c, grey levels: what a flawless picture's rounding makes.
 _LEAST_C = 1.0
 
@@ -184,16 +186,24 @@ class _Smears:
 
     def add(self, plane: Float32, look: Look, c: float, band: Band, field: Float32) -> None:
         """Adds to the field of a plane what moves fast in the band and does not show."""
+        smeared = (band.steps > FAST_PX) & band.is_empty(field)
+        if not smeared.any():
+            return
+        size = self._plane.shape[::-1]
+        cv2.resize(plane, size, dst=self._plane, interpolation=cv2.INTER_AREA)
+        band.paint(smeared, self._mask)
         for scale in WIDER:
-            smeared = (band.steps > scale.from_px) & band.is_empty(field)
-            if not smeared.any():
-                return
-            if scale is WIDER[0]:
-                size = self._plane.shape[::-1]
-                cv2.resize(plane, size, dst=self._plane, interpolation=cv2.INTER_AREA)
-            self._filter.find_ridges(self._plane, look, c, self._field, scale.times / 2)
-            band.paint(smeared, self._mask)
+            times = scale.times / 2
+            rows = self._rows(_AROUND * times * max(look.sigmas))
+            self._filter.find_ridges(self._plane[rows], look, c, self._field[rows], times)
             smears.keep_longer_of_half(self._field, self._mask, scale.longest, field)
+
+    def _rows(self, around_px: float) -> slice:
+        """The rows of half the size that what the mask shows depends on."""
+        masked = np.flatnonzero(self._mask.any(axis=1))
+        if len(masked) == 0:
+            return slice(1)
+        return slice(max(masked[0] // 2 - round(around_px), 0), masked[-1] // 2 + round(around_px))
 
 
 def gaussian_kernel(sigma: float) -> Float32:

@@ -20,6 +20,8 @@ _YOUNGEST_NS, _OLDEST_NS, _LATEST_NS = 50_000_000, 450_000_000, 250_000_000
 _MOST = 64
 # How far from where it is going a thread is looked for: so many times its step and so many px more.
 _STEPS, _BESIDE_PX, _FURTHEST_PX = 2.0, 6.0, 40.0
+# And how many of its steps beyond its ends, where it may be held by something dark.
+_BEYOND = 1.5
 _PLACES_ACROSS = np.linspace(-1, 1, 61)
 # Vectors shorter than this along the thread show nothing.
 _FAINT = 0.2
@@ -31,14 +33,15 @@ class Scale:
 
     times: int
     """How much wider."""
-    from_px: float
-    """How far a thread has to move across itself between two frames to be looked for at this scale."""
     longest: float
-    """Length of its vectors, at most: the wider a smear, the fainter. This is what is left of a thread as
-    wide as two sigmas, whose S is 2c, when this scale begins to see it better than half the scale does."""
+    """Length of a smear's vectors, at most: the wider a smear, the fainter. This is what is left of a thread
+    as wide as two sigmas, whose S is 2c, when this scale begins to see it better than half of it does."""
 
 
-WIDER = Scale(2, 5.0, 0.576), Scale(4, 8.0, 0.193)
+WIDER = Scale(4, 0.193), Scale(2, 0.576)
+"""The widest first: what is too dark there for a smear is none on the others either."""
+FAST_PX = 5.0
+"""How far a thread moves across itself between two frames before it is looked for as a smear."""
 
 
 class Course:
@@ -103,11 +106,15 @@ class Band:
     def paint(self, which: Bool, mask: Image) -> None:
         """Sets (H, W) `mask` within reach of the places that are meant, and elsewhere to 0."""
         mask[:] = 0
-        bound = 4 * max(mask.shape)
-        ends = np.rint(self.pixels.clip(-bound, bound)).astype(int)
-        for i in np.flatnonzero(which):
-            piece = ends[max(i - 1, 0) : i + 2]
-            cv2.polylines(mask, [piece], False, 1, thickness=round(2 * self._reach[i]))
+        middle, bound = self.pixels.copy(), 4 * max(mask.shape)
+        middle[0] -= _BEYOND * self.steps[0] * self.tangents[0]
+        middle[-1] += _BEYOND * self.steps[-1] * self.tangents[-1]
+        across = self._reach[:, None] * _turned(self.tangents)
+        one, other = (
+            np.rint((middle + x).clip(-bound, bound)).astype(int) for x in (across, -across)
+        )
+        for i in np.flatnonzero(which[:-1] | which[1:]):
+            cv2.fillConvexPoly(mask, np.array([one[i], one[i + 1], other[i + 1], other[i]]), 1)
 
     @property
     def _reach(self) -> Float64:
