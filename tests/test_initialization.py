@@ -325,6 +325,36 @@ def test_strands_of_one_thread_are_told_apart(scenario: str, seed: int) -> None:
     assert found.confidence > 0.5
 
 
+@pytest.mark.parametrize("seed", [301, 313, 314, 362])
+def test_strands_that_share_a_stretch_may_be_exchanged(seed: int) -> None:
+    """A like thread joins this one for a while; both views take its way out for this one's."""
+    scene = open_scene("clutter", seed)
+    field, start = field_and_seed(scene)
+    found = initialize(field, scene.rig, start)
+    is_right = curve_error(dense(found.curve), scene.truth(0)[0].points).rms < 0.3
+    assert is_right or found.confidence < 0.5
+    assert any("a stretch that two strands share" in reason for reason in found.reasons)
+
+
+def test_where_a_shared_stretch_leads_is_told_by_long_arms() -> None:
+    scene = open_scene("two-threads", 303)
+    field, start = field_and_seed(scene)
+    found = initialize(field, scene.rig, start)
+    assert curve_error(dense(found.curve), scene.truth(0)[0].points).rms < 0.3
+    assert found.confidence > 0.5
+    assert any("a stretch that two strands share" in reason for reason in found.reasons)
+
+
+def test_an_end_that_neither_view_shows_is_not_relied_on() -> None:
+    """The curve ends in the middle of a stretch that it shares with another thread."""
+    scene = open_scene("clutter", 358, "endoscope")
+    field, start = field_and_seed(scene)
+    found = initialize(field, scene.rig, start)
+    assert max(curve_error(dense(found.curve), scene.truth(0)[0].points).ends) > 10
+    assert found.confidence < 0.5
+    assert "first end not seen as an end" in found.reasons
+
+
 def test_a_crossing_that_neither_view_can_tell_is_doubtful() -> None:
     """Another thread runs beside this one, and leaves it more smoothly than it goes on itself."""
     scene = open_scene("clutter", 250)

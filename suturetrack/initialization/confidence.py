@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization.doubts import CROSSING, FADES, FOREIGN, HIDDEN, Doubt
+from suturetrack.initialization.doubts import CROSSING, FADES, FOREIGN, HIDDEN, SHARED, Doubt
 from suturetrack.initialization.growth import Chain
 from suturetrack.initialization.model import PlacedDoubts, remaining
 from suturetrack.initialization.samples import Samples
@@ -44,6 +44,8 @@ _SHARP = 0.5
 _SHARP_COSINE = 0.5
 _BEND_REACH = 8
 """Pixels on both sides of a place between which the curve bends there."""
+_NO_END = 0.4
+"""What an end that neither view shows as one leaves of the confidence."""
 _GRAVE = 0.53
 """What a grave doubt leaves of the confidence at most."""
 _FEW = 6
@@ -100,7 +102,7 @@ def judge(
         if any(r.at_border for r in readings):
             reasons.append(f"{_ORDINAL[end]} end cut by the image border")
         elif all(np.isnan(r.offset_px) for r in readings):
-            confidence *= 0.7
+            confidence *= _NO_END
             reasons.append(f"{_ORDINAL[end]} end not seen as an end")
     return float(confidence), tuple(reasons), (left, right)
 
@@ -150,7 +152,7 @@ def _placed(
         at = int(np.argmin(np.linalg.norm(line - place, axis=1)))
         there = counterpart[at]
         both = max(rest, min(_same(why, there, doubts[1 - view]), default=1.0))
-        if not _is_shared(place, line, counterpart, chains[1 - view].pixels):
+        if why == SHARED or not _is_shared(place, line, counterpart, chains[1 - view].pixels):
             left = rest
         elif why in (CROSSING, FADES, *FOREIGN) and both < _GRAVE:
             left = both
@@ -216,13 +218,19 @@ def _is_near(where: Float64, places: Float64) -> bool:
 
 
 def _distinct(chain: Chain) -> list[Doubt]:
-    """The doubts, the gravest first, one for each place beside those about other threads there."""
+    """The doubts, the gravest first, one of a kind for each place: about other threads, about stretches that
+    strands share, and all the rest."""
     kept: list[Doubt] = []
     for doubt in sorted(chain.doubts, key=lambda d: d[2]):
-        alike = [d for d in kept if (d[1] in FOREIGN) == (doubt[1] in FOREIGN)]
+        alike = [d for d in kept if _kind(d) == _kind(doubt)]
         if all(np.linalg.norm(doubt[0] - other[0]) > _SAME_PLACE_PX for other in alike):
             kept.append(doubt)
     return kept
+
+
+def _kind(doubt: Doubt) -> str:
+    why = doubt[1]
+    return FOREIGN[0] if why in FOREIGN else SHARED if why == SHARED else CROSSING
 
 
 def _agreement(pixels: Float64, chain: Float64, rig: StereoRig) -> float:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import expit
 
 from suturetrack.initialization.paths import follow
 from suturetrack.initialization.pricing import FREE_END, TOUCHING_PX
 from suturetrack.initialization.segments import ARM, Ridges, chain_tangents
+from suturetrack.initialization.strands import ENERGY
 from suturetrack.initialization.topology import Merged, swap, within_reach
 from suturetrack.types import Float64
 
@@ -16,6 +18,8 @@ Doubt = tuple[Float64, str, float]
 
 CROSSING = "an ambiguous crossing"
 """Where the thread might leave a crossing another way."""
+SHARED = "a stretch that two strands share"
+"""Which of them goes on which way, their arms do not tell."""
 JOINED = "another strand that ends on it"
 """Where two strands come and one goes on: it may be the other one."""
 BENT = "a bend as of two strands"
@@ -75,6 +79,9 @@ def _at_merges(merged: Merged, entries: list[int]) -> list[tuple[int, str, float
             found.append((entry, "a sharp bend", 0.6))
         elif strain > 0:
             found.append((entry, CROSSING, max(1 - _STRAIN * strain, 0.1)))
+        ends = entry, merged.partner[entry]
+        for lead in [merged.lead[e] for e in ends if e in merged.lead][:1]:
+            found.append((entry, SHARED, float(expit(lead / ENERGY))))
         if entry in merged.bent:
             found.append((entry, BENT, _FOREIGN))
     return found

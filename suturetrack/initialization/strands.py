@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
@@ -19,7 +20,7 @@ _LIKELY = 1.3
 """Price of a merge up to which it is a rival of others."""
 _RIVAL, _CLOSE_RIVAL = 0.5, 0.25
 """How much dearer a rival may be that counts, and one with which a segment may be shared."""
-_BENT = 0.03
+ENERGY = 0.03
 """Price of a unit of the energy by which arms fit together less well."""
 _MOST_BENT = 25.0
 _LEAST_HIDDEN_ARM = 20
@@ -41,13 +42,18 @@ class Strands:
         self,
         segments: tuple[Float64, ...],
         partner: dict[int, int],
-        merges: Merge,
+        merges: Merge | None,
         depth: Depth | None,
     ) -> None:
         self._segments, self._partner, self._depth = segments, partner, depth
-        self._leads = _leads(merges)
+        self._leads = {} if merges is None else _leads(merges)
         self._arms: dict[int, Float64] = {}
         self._disparities: dict[int, Disparities | None] = {}
+
+    @cached_property
+    def pieces(self) -> Strands:
+        """The arms as far as the segments go by themselves, whoever may share them."""
+        return Strands(self._segments, {}, None, self._depth)
 
     def with_depth(self, merges: Merge) -> Merge:
         """The merges, those dearer whose arms differ in depth."""
@@ -55,7 +61,7 @@ class Strands:
         for k in np.flatnonzero(cost < _LIKELY):
             i, j = merges.pairs[k].tolist()
             if min(self._lead(i), self._lead(j)) < _RIVAL:
-                cost[k] += _BENT * self._step(i, j)
+                cost[k] += ENERGY * self._step(i, j)
         return Merge(merges.pairs, cost, merges.touching)
 
     def change(self, pairs: list[tuple[int, int]], others: list[tuple[int, int]]) -> float | None:
@@ -81,7 +87,7 @@ class Strands:
         return _bend(one, other) + self._step(i, j) + (length / _HIDDEN_PX) ** 2
 
     def _misfit(self, i: int, j: int) -> float:
-        return _BENT * (_bend(self._arm(i), self._arm(j)) + self._step(i, j))
+        return ENERGY * (_bend(self._arm(i), self._arm(j)) + self._step(i, j))
 
     def _step(self, i: int, j: int) -> float:
         """Energy of a step in depth from one arm to the other."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -50,6 +50,9 @@ class Merged:
     """The joined ends whose strands bend there as two would, and not one."""
     hidden: frozenset[int] = frozenset()
     """The joined ends of strands that something hides in between."""
+    lead: Mapping[int, float] = field(default_factory=dict)
+    """Of ends at which two strands part that touched: by how much the ways that they take cost less than
+    exchanged, by their arms."""
 
     def is_copy(self, one: int, other: int) -> bool:
         """Whether two ends are the same one of a segment that strands share."""
@@ -80,12 +83,15 @@ def _merge(ridges: Ridges, merges: Merge, strands: Strands | None) -> Merged:
     _exchange(partner, price)
     if strands is not None:
         _uncross(ridges.segments, partner, price, strands)
-    segments = _share(ridges.segments, partner, price, strands)
+    lead: dict[int, float] = {}
+    segments = _share(ridges.segments, partner, price, strands, lead)
     _open_rings(partner, price)
     segments = double_stubs(segments, partner, price)
     _pair(partner, merges.pairs[order[merges.touching[order]]])
     bent = _bent(ridges.segments, segments, partner, strands)
-    return Merged(segments, partner, price, bent, _bridge_hidden(ridges, partner, price, strands))
+    hidden = _bridge_hidden(ridges, partner, price, strands)
+    lead |= _leads_beside(ridges.segments, segments, partner, price, strands)
+    return Merged(segments, partner, price, bent, hidden, lead)
 
 
 def _bent(
@@ -187,8 +193,9 @@ def _share(
     partner: dict[int, int],
     price: dict[tuple[int, int], float],
     strands: Strands | None,
+    lead: dict[int, float],
 ) -> tuple[Float64, ...]:
-    """Doubles the runs of segments that a second strand waits for at both ends."""
+    """Doubles the runs of segments that a second strand waits for at both ends; tells the `lead`."""
     waiting: dict[int, tuple[float, int]] = {}
     for (i, j), cost in price.items():
         if i in partner and j not in partner and cost < 2 * FREE_END:
@@ -203,7 +210,10 @@ def _share(
         if any(e // 2 in taken for e in run):
             continue
         taken.update(e // 2 for e in run)
-        _double(run, one, other, segments, copies, partner, price, strands)
+        last = partner[run[-1] ^ 1]
+        better_by = _double(run, one, other, segments, copies, partner, price, strands)
+        if better_by is not None:
+            lead[last] = lead[other] = better_by
     return tuple(copies)
 
 
@@ -231,23 +241,19 @@ def _double(
     partner: dict[int, int],
     price: dict[tuple[int, int], float],
     strands: Strands | None,
-) -> None:
-    """Leads a second strand, which waits with the ends `one` and `other`, through a run."""
+) -> float | None:
+    """Leads a second strand, which waits with the ends `one` and `other`, through a run; by how much
+    that costs less than the other way, as far as the strands tell."""
     start, stop = run[0], run[-1] ^ 1
     first, last = partner[start], partner[stop]
     # Of the two ways to connect the strands none may close a loop; else the smoother one is taken.
     ring = other_end(one, partner) == other or is_ring(start, partner)
+    told = None
     if ring or other == other_end(first, partner) or one == other_end(last, partner):
         swap = ring
     else:
         straight, crossed = [(one, other), (first, last)], [(one, last), (first, other)]
-        change = None
-        if strands is not None:
-            ways = (
-                [(_original(i, originals, copies), _original(j, originals, copies)) for i, j in way]
-                for way in (straight, crossed)
-            )
-            change = strands.change(*ways)
+        change = told = _change(straight, crossed, originals, copies, strands)
         if change is None:
             change = sum(price.get(p, 2.0) for p in crossed)
             change -= sum(price.get(p, 2.0) for p in straight)
@@ -264,6 +270,48 @@ def _double(
     pairs += [(copied[stop], last), (stop, other)] if swap else [(copied[stop], other)]
     for i, j in pairs:
         partner[i], partner[j] = j, i
+    return None if told is None else abs(told)
+
+
+def _change(
+    taken: list[tuple[int, int]],
+    exchanged: list[tuple[int, int]],
+    originals: Sequence[Float64],
+    segments: Sequence[Float64],
+    strands: Strands | None,
+) -> float | None:
+    """How much dearer the ends of two strands are joined as `exchanged`; None where it is not told."""
+    if strands is None:
+        return None
+    ways = (
+        [(_original(i, originals, segments), _original(j, originals, segments)) for i, j in way]
+        for way in (taken, exchanged)
+    )
+    return strands.change(*ways)
+
+
+def _leads_beside(
+    originals: tuple[Float64, ...],
+    segments: tuple[Float64, ...],
+    partner: dict[int, int],
+    price: dict[tuple[int, int], float],
+    strands: Strands | None,
+) -> dict[int, float]:
+    """The leads of strands that pass beside a short segment of another strand, which they touch."""
+    within, lead = within_reach(price), dict[int, float]()
+    pieces = None if strands is None else strands.pieces
+    for a, b in partner.items():
+        for near in within.get(a, ()):
+            far = near ^ 1
+            if far not in within.get(b, ()) or len(segments[near // 2]) >= REACH:
+                continue
+            c, d = partner.get(near, b), partner.get(far, a)
+            if len({a, b, c, d} - {near, far}) < 4:
+                continue
+            change = _change([(a, b), (c, d)], [(a, d), (c, b)], originals, segments, pieces)
+            if change is not None:
+                lead[a] = lead[b] = min(change, lead.get(a, np.inf))
+    return lead
 
 
 def _open_rings(partner: dict[int, int], price: dict[tuple[int, int], float]) -> None:
