@@ -12,7 +12,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.contrast import GRAY, SIGMAS, Contrast, channel_means
 from suturetrack.kernels import ridge, rims, smears
 from suturetrack.segmentation.config import SegmentationConfig
-from suturetrack.segmentation.smear import FAST_PX, WIDER, Band
+from suturetrack.segmentation.smear import WIDER, Band
 from suturetrack.types import Float32, Float64, Image, StereoFrame
 
 Pair = tuple[Float32, Float32]
@@ -186,7 +186,7 @@ class _Smears:
 
     def add(self, plane: Float32, look: Look, c: float, band: Band, field: Float32) -> None:
         """Adds to the field of a plane what moves fast in the band and does not show."""
-        smeared = (band.steps > FAST_PX) & band.is_empty(field)
+        smeared = band.is_smeared(field)
         if not smeared.any():
             return
         size = self._plane.shape[::-1]

@@ -18,6 +18,9 @@ from suturetrack.types import Bool, Float32, Float64, Image
 # where the last of them is older, nobody knows where the thread is by now.
 _YOUNGEST_NS, _OLDEST_NS, _LATEST_NS = 50_000_000, 450_000_000, 250_000_000
 _MOST = 64
+# How far a thread moves across itself between two frames before it is looked for as a smear, and the share of
+# what is shown of it that moves no faster.
+_FAST_PX, _NEARLY_ALL = 5.0, 0.9
 # How far from where it is going a thread is looked for: so many times its step and so many px more.
 _STEPS, _BESIDE_PX, _FURTHEST_PX = 2.0, 6.0, 40.0
 # And how many of its steps beyond its ends, where it may be held by something dark.
@@ -40,8 +43,6 @@ class Scale:
 
 WIDER = Scale(4, 0.193), Scale(2, 0.576)
 """The widest first: what is too dark there for a smear is none on the others either."""
-FAST_PX = 5.0
-"""How far a thread moves across itself between two frames before it is looked for as a smear."""
 
 
 class Course:
@@ -83,14 +84,26 @@ class Band:
     """(k, 2) unit tangents."""
     steps: Float64
     """(k,) px by which it has moved across itself between two frames, at most, of late."""
+    latest: Float64
+    """(k,) px by which it did so last."""
 
     @classmethod
     def of(cls, pixels: Float64, before: Float64) -> Band:
         """From (k, 2) pixels and (n, k, 2) where they were a frame before, at each of n velocities."""
         along = np.gradient(pixels, axis=0)
         tangents = along / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-        steps = np.abs(np.sum((pixels - before) * _turned(tangents), axis=2)).max(axis=0)
-        return cls(pixels, tangents, steps)
+        steps = np.abs(np.sum((pixels - before) * _turned(tangents), axis=2))
+        return cls(pixels, tangents, steps.max(axis=0), steps[-1])
+
+    def is_smeared(self, field: Float32) -> Bool:
+        """(k,) where the thread is fast and an (H, W, 2) field does not show it.
+
+        Where it shows a part that is as fast, something else hides the rest.
+        """
+        empty = self.is_empty(field)
+        shown = self.latest[~empty]
+        fastest = float(np.quantile(shown, _NEARLY_ALL)) if len(shown) else 0.0
+        return empty & (self.steps > max(_FAST_PX, fastest))
 
     def is_empty(self, field: Float32) -> Bool:
         """(k,) whether an (H, W, 2) field shows nothing along the thread within reach."""
