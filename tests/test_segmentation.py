@@ -242,13 +242,16 @@ def test_no_image_is_allocated_once_warm(rectified: bool, distorted_rig: StereoR
 
 
 _WARMS_UP = """
-from suturetrack.kernels import ridge, rims
+import numpy as np
+from suturetrack.kernels import ridge, rims, smears
 from suturetrack.segmentation import Segmenter
+from suturetrack.segmentation.smear import Band
 from suturetrack.stage import open_scene
 from suturetrack.types import Seed, Stamp, StereoFrame
 
 def compiled():
-    return {name: k.signatures for name, k in vars(ridge).items() if hasattr(k, "signatures")}
+    kernels = {**vars(ridge), **vars(rims), **vars(smears)}
+    return {name: k.signatures for name, k in kernels.items() if hasattr(k, "signatures")}
 
 scene = open_scene("two-threads", 3)
 segmenter = Segmenter(scene.rig)
@@ -260,6 +263,15 @@ for name in scene.threads:
     segmenter.learn(frame, Seed(name, pixel=scene.seed_pixel(0, name)))
 segmenter.step(frame)
 assert segmenter.threads == scene.threads
+# The thread moves fast, and is in the pictures no more.
+for k in range(3):
+    points = scene.truth(0)[0].points[::10] + [0.05 * k * scene.truth(0)[0].length, 0, 0]
+    segmenter.follow(k * 33_000_000, points, scene.threads[0])
+blank = np.full_like(frame.left, 128)
+painted, paint = [], Band.paint
+Band.paint = lambda *args: painted.append(paint(*args))
+segmenter.step(StereoFrame(Stamp(4, 132_000_000, 0), blank, blank))
+assert painted
 print({name: k for name, k in compiled().items() if k != before[name]})
 """
 

@@ -144,7 +144,7 @@ def _placed(
     """Where on the curve a view is in doubt, and what that leaves; `lines` are the curve in both views.
 
     Two views that come to the same by themselves are not both mistaken easily, but what neither
-    could tell stays doubtful.
+    could tell stays doubtful. Where strands share a stretch both are mistaken alike.
     """
     line, counterpart = lines[view], lines[1 - view]
     placed = []

@@ -9,7 +9,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.contrast import SIGMAS, Contrast, contrast_along, contrast_at
-from suturetrack.kernels import ridge
+from suturetrack.kernels import ridge, smears
 from suturetrack.segmentation.config import SegmentationConfig
 from suturetrack.segmentation.sight import SLOTS, Pair, Sight, first_look, learned_look
 from suturetrack.segmentation.smear import Course
@@ -173,6 +173,7 @@ class Segmenter:
             black = np.zeros(shape, np.uint8)
             field = sight.step(StereoFrame(Stamp(0, 0, 0), black, black), 0)
             ridge.keep_longer(field[0], field[1])
+        smears.keep_longer_of_half(field[0], black, 1.0, field[1])
 
     def _check(self, frame: StereoFrame) -> None:
         width, height = self._rig.image_size

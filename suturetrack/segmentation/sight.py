@@ -189,21 +189,18 @@ class _Smears:
         smeared = band.is_smeared(field)
         if not smeared.any():
             return
+        band.paint(smeared, self._mask)
+        painted = np.flatnonzero(self._mask.any(axis=1)) // 2
+        if len(painted) == 0:
+            return
         size = self._plane.shape[::-1]
         cv2.resize(plane, size, dst=self._plane, interpolation=cv2.INTER_AREA)
-        band.paint(smeared, self._mask)
         for scale in WIDER:
             times = scale.times / 2
-            rows = self._rows(_AROUND * times * max(look.sigmas))
+            around = round(_AROUND * times * max(look.sigmas))
+            rows = slice(max(painted[0] - around, 0), painted[-1] + around)
             self._filter.find_ridges(self._plane[rows], look, c, self._field[rows], times)
             smears.keep_longer_of_half(self._field, self._mask, scale.longest, field)
-
-    def _rows(self, around_px: float) -> slice:
-        """The rows of half the size that what the mask shows depends on."""
-        masked = np.flatnonzero(self._mask.any(axis=1))
-        if len(masked) == 0:
-            return slice(1)
-        return slice(max(masked[0] // 2 - round(around_px), 0), masked[-1] // 2 + round(around_px))
 
 
 def gaussian_kernel(sigma: float) -> Float32:
