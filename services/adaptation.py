@@ -15,7 +15,7 @@ from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.segmentation import Segmenter
-from suturetrack.types import InputError, Seed, Status, StereoFrame, ThreadState
+from suturetrack.types import InputError, Seed, Stamp, Status, StereoFrame, ThreadState
 
 _PERIOD_NS = 1_000_000_000
 """Of capture time, so that a recording adapts as the live run did."""
@@ -46,15 +46,26 @@ class Adaptation:
         self._sample: StereoFrame | None = None
         self._awaited: set[str] = set()
         self._arrived: list[ThreadState] = []
+        self._latest: dict[str, Stamp] = {}
+        """Of the last state of each thread."""
+        self._segmented: list[Stamp] = []
+        """The last two frames."""
 
     def catch_up(self) -> None:
-        """To be called before a frame is segmented: takes in the states that have come."""
-        while (state := self._states.get(0)) is not None:
+        """To be called before a frame is segmented: takes in the states that have come and, in lock-step,
+        those of the last frame that are still to come."""
+        self._take_in_all()
+        reported = {t for t in self._segmenter.threads if self._latest.get(t) in self._segmented}
+        while self._patience and any(self._latest[t] != self._segmented[-1] for t in reported):
+            state = self._states.get(self._patience)
+            if state is None:
+                break
             self._take_in(state)
 
     def step(self, frame: StereoFrame) -> None:
         """To be called once for every frame that was segmented, after its field was published."""
-        self.catch_up()
+        self._take_in_all()
+        self._segmented = [*self._segmented[-1:], frame.stamp]
         sample = self._sample
         period = self._pause_ns if self._segmenter.unlearned else _PERIOD_NS
         age = period if sample is None else frame.stamp.capture_ns - sample.stamp.capture_ns
@@ -88,8 +99,13 @@ class Adaptation:
             elif all_lost:
                 self._segmenter.fade(thread)
 
+    def _take_in_all(self) -> None:
+        while (state := self._states.get(0)) is not None:
+            self._take_in(state)
+
     def _take_in(self, state: ThreadState) -> None:
         self._arrived.append(state)
+        self._latest[state.thread] = state.stamp
         follow(self._segmenter, scaled(state, 1 / self._rig.metres_per_unit))
 
     def _learn_first(self, sample: StereoFrame, state: ThreadState) -> None:

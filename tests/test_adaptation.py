@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -233,3 +234,38 @@ def test_a_segmenter_that_is_started_again_learns_from_what_is_seen_of_a_thread(
     rig.stop()
     assert not rig.errors
     assert (shown[0] != shown[1]) is learns
+
+
+@pytest.mark.parametrize("is_late", [True, False])
+def test_in_lock_step_a_frame_waits_for_the_states_of_the_last_one(
+    scenes: tuple[Scene, Scene], is_late: bool
+) -> None:
+    """How a thread moved until then tells where its smear is looked for."""
+    desk, told = Desk(scenes), []
+    desk.segmenter.follow = lambda capture_ns, *_: told.append(capture_ns)  # type: ignore[method-assign]
+    for index in range(2):
+        desk.frame(index, state_of(desk.curve, Stamp(index, 0, 0)))
+        desk.adaptation.catch_up()
+    desk.frame(2)
+    last = replace(state_of(desk.curve, Stamp(2, 500_000_000, 0)))
+    message = scaled(last, desk.rig.metres_per_unit)
+    sender = threading.Timer(0.2 if is_late else 0.0, desk.bus.publish, (topics.STATE, message))
+    sender.start()
+    desk.adaptation.catch_up()
+    sender.join()
+    assert told == [0, 250_000_000, 500_000_000]
+
+
+def test_what_is_reported_no_more_is_waited_for_once(
+    scenes: tuple[Scene, Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("services.adaptation._LONGEST_WAIT_S", 0.3)
+    desk = Desk(scenes)
+    desk.frame(0, state_of(desk.curve, Stamp(0, 0, 0)))
+    waits = []
+    for index in range(1, 5):
+        began = time.monotonic()
+        desk.adaptation.catch_up()
+        waits.append(time.monotonic() - began > 0.25)
+        desk.frame(index)
+    assert waits == [False, True, False, False]
