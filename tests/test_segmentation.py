@@ -264,13 +264,13 @@ for name in scene.threads:
 segmenter.step(frame)
 assert segmenter.threads == scene.threads
 # The thread moves fast, and is in the pictures no more.
-for k in range(3):
-    points = scene.truth(0)[0].points[::10] + [0.05 * k * scene.truth(0)[0].length, 0, 0]
-    segmenter.follow(k * 33_000_000, points, scene.threads[0])
 blank = np.full_like(frame.left, 128)
 painted, paint = [], Band.paint
 Band.paint = lambda *args: painted.append(paint(*args))
-segmenter.step(StereoFrame(Stamp(4, 132_000_000, 0), blank, blank))
+for k in range(1, 12):
+    capture_ns, shift = k * 33_000_000, 0.05 * abs(k - 6) * scene.truth(0)[0].length
+    segmenter.step(StereoFrame(Stamp(k, capture_ns, 0), blank, blank))
+    segmenter.follow(capture_ns, scene.truth(0)[0].points[::10] + [shift, 0, 0], scene.threads[0])
 assert painted
 print({name: k for name, k in compiled().items() if k != before[name]})
 """

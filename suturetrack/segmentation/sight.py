@@ -186,7 +186,7 @@ class _Smears:
 
     def add(self, plane: Float32, look: Look, c: float, band: Band, field: Float32) -> None:
         """Adds to the field of a plane what moves fast in the band and does not show."""
-        smeared = band.is_smeared(field)
+        smeared = band.look_at(field)
         if not smeared.any():
             return
         band.paint(smeared, self._mask)

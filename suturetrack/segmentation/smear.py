@@ -12,15 +12,13 @@ import cv2
 import numpy as np
 
 from suturetrack.camera import StereoRig
+from suturetrack.segmentation.shutter import SLOWEST_PX, Shutter
 from suturetrack.types import Bool, Float32, Float64, Image
 
 # Curves count once they are so old, lest a field depend on how fast they came, and until they are so old;
 # where the last of them is older, nobody knows where the thread is by now.
 _YOUNGEST_NS, _OLDEST_NS, _LATEST_NS = 50_000_000, 450_000_000, 250_000_000
 _MOST = 64
-# How far a thread moves across itself between two frames before it is looked for as a smear, and the share of
-# what is shown of it that moves no faster.
-_FAST_PX, _NEARLY_ALL = 5.0, 0.9
 # How far from where it is going a thread is looked for: so many times its step and so many px more.
 _STEPS, _BESIDE_PX, _FURTHEST_PX = 2.0, 6.0, 40.0
 # And how many of its steps beyond its ends, where it may be held by something dark.
@@ -46,15 +44,19 @@ WIDER = Scale(4, 0.193), Scale(2, 0.576)
 
 
 class Course:
-    """Where a thread is going, by its last curves."""
+    """Where a thread is going, by its last curves, and how fast it may go and still be seen."""
 
     def __init__(self) -> None:
         self._curves: deque[tuple[int, Float64]] = deque(maxlen=_MOST)
+        self._bands: dict[int, tuple[Band, Band]] = {}
+        """By the time of the frame, until its own curve and the next one have come."""
+        self._shutter = Shutter()
 
     def learn(self, capture_ns: int, points: Float64) -> None:
         """Where the thread was: (k, 3) points spread evenly along it, always as many."""
         if self._curves and capture_ns <= self._curves[-1][0]:
             self._curves.clear()
+            self._bands.clear()
         self._curves.append((capture_ns, points))
 
     def bands(self, now_ns: int, rig: StereoRig) -> tuple[Band, Band] | None:
@@ -65,16 +67,32 @@ class Course:
         times = 1e-9 * np.array([t for t, _ in known])
         points = np.array([p for _, p in known])
         gaps = np.diff(times)
+        frame = gaps.min()
+        self._look_back(known, frame, rig)
         velocities = np.diff(points, axis=0) / gaps[:, None, None]
         now = points[-1] + velocities[-1] * (1e-9 * now_ns - times[-1])
-        before = rig.project(now - velocities * gaps.min())
-        left, right = (
-            Band.of(pixels, last) for pixels, last in zip(rig.project(now), before, strict=True)
-        )
+        before = rig.project(now - velocities * frame)
+        clear = self._shutter.fastest_clear
+        left, right = (Band.of(p, b, clear) for p, b in zip(rig.project(now), before, strict=True))
+        self._bands[now_ns] = left, right
         return left, right
 
+    def _look_back(self, known: list[tuple[int, Float64]], frame: float, rig: StereoRig) -> None:
+        """Learns what was shown of the thread at the steps that it really made."""
+        for (before, start), (at, points), (after, end) in zip(
+            known[:-2], known[1:-1], known[2:], strict=True
+        ):
+            if (looked := self._bands.pop(at, None)) is None:
+                continue
+            step = (end - start) / (1e-9 * (after - before)) * frame
+            views = looked, rig.project(points), rig.project(points - step)
+            for band, *pixels in zip(*views, strict=True):
+                if band.empty is not None:
+                    self._shutter.learn(_steps_across(*pixels), ~band.empty)
+        self._bands = {t: bands for t, bands in self._bands.items() if t > known[0][0]}
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(eq=False)
 class Band:
     """Where one view should show a thread, and how fast it moves there."""
 
@@ -84,28 +102,25 @@ class Band:
     """(k, 2) unit tangents."""
     steps: Float64
     """(k,) px by which it has moved across itself between two frames, at most, of late."""
-    latest: Float64
-    """(k,) px by which it did so last."""
+    clear: float
+    """How many px it may do so and still be seen."""
+    empty: Bool | None = None
+    """(k,) whether the field that was looked at shows nothing along it; None where nothing is fast."""
 
     @classmethod
-    def of(cls, pixels: Float64, before: Float64) -> Band:
+    def of(cls, pixels: Float64, before: Float64, clear: float) -> Band:
         """From (k, 2) pixels and (n, k, 2) where they were a frame before, at each of n velocities."""
-        along = np.gradient(pixels, axis=0)
-        tangents = along / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-        steps = np.abs(np.sum((pixels - before) * _turned(tangents), axis=2))
-        return cls(pixels, tangents, steps.max(axis=0), steps[-1])
+        steps = _steps_across(pixels, before).max(axis=0)
+        return cls(pixels, _tangents(pixels), steps, clear)
 
-    def is_smeared(self, field: Float32) -> Bool:
-        """(k,) where the thread is fast and an (H, W, 2) field does not show it.
+    def look_at(self, field: Float32) -> Bool:
+        """(k,) where the thread is too fast to be seen, and an (H, W, 2) field does not show it."""
+        if self.steps.max() < SLOWEST_PX:
+            return np.zeros(len(self.steps), bool)
+        self.empty = self._is_empty(field)
+        return self.empty & (self.steps > self.clear)
 
-        Where it shows a part that is as fast, something else hides the rest.
-        """
-        empty = self.is_empty(field)
-        shown = self.latest[~empty]
-        fastest = float(np.quantile(shown, _NEARLY_ALL)) if len(shown) else 0.0
-        return empty & (self.steps > max(_FAST_PX, fastest))
-
-    def is_empty(self, field: Float32) -> Bool:
+    def _is_empty(self, field: Float32) -> Bool:
         """(k,) whether an (H, W, 2) field shows nothing along the thread within reach."""
         height, width = field.shape[:2]
         across = _turned(self.tangents)[:, None, :] * self._reach[:, None, None]
@@ -132,6 +147,16 @@ class Band:
     @property
     def _reach(self) -> Float64:
         return np.minimum(_STEPS * self.steps + _BESIDE_PX, _FURTHEST_PX)
+
+
+def _steps_across(pixels: Float64, before: Float64) -> Float64:
+    """(..., k) px by which (k, 2) pixels of a thread moved across it from (..., k, 2) before."""
+    return np.abs(np.sum((pixels - before) * _turned(_tangents(pixels)), axis=-1))
+
+
+def _tangents(pixels: Float64) -> Float64:
+    along = np.gradient(pixels, axis=0)
+    return along / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
 
 
 def _turned(vectors: Float64) -> Float64:
