@@ -365,6 +365,21 @@ def test_a_crossing_that_neither_view_can_tell_is_doubtful() -> None:
     assert is_right or any("an ambiguous crossing" in reason for reason in found.reasons)
 
 
+@pytest.mark.parametrize("is_alone", [True, False])
+def test_how_a_thread_passes_itself_is_less_doubtful_where_it_is_alone(is_alone: bool) -> None:
+    """A way that leaves a part of it to nobody is a bad one; with others about, it may be theirs."""
+    scene = open_scene("knot", 1111, "endoscope")
+    field, start = field_and_seed(scene)
+    alone = initialize(field, scene.rig, start)
+    assert curve_error(dense(alone.curve), scene.truth(0)[0].points).rms < 0.3
+    left, right = field.left.copy(), field.right.copy()
+    for view in () if is_alone else (left, right):
+        view[20:460, 30] = 0.0, 0.9
+    found = initialize(RidgeField(field.stamp, left, right), scene.rig, start)
+    np.testing.assert_allclose(found.curve.control_points, alone.curve.control_points)
+    assert (found.confidence >= 0.5) == is_alone
+
+
 def look_at(strands: list[Float64], seed: Float64, rig: StereoRig) -> Initialization:
     """The thread through a seed (2,), among strands at one depth."""
     left, right = None, None

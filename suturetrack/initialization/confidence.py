@@ -39,6 +39,12 @@ _BESIDE_PX = 5.0
 """Distance from a curve up to which a ridge is the rim of the thread or its highlight."""
 _FAINT = 0.4
 """Strength of a ridge, against the thread's, below which it is not another thread's."""
+_NEXT_TO_NOTHING = 0.1
+"""Length of other ridges, against the thread's, up to which it is alone."""
+_ALONE = 4.0
+"""How many times better the odds are that a thread that is alone goes on as it was found to: another way
+would leave a part of it to nobody. Of 171 such starts, 169 were right and as many in order, however much
+was in doubt."""
 _SHARP = 0.5
 """What is left of the confidence at a sharp bend, at least, where no other ridge is near."""
 _SHARP_COSINE = 0.5
@@ -90,6 +96,8 @@ def judge(
     confidence *= held
     doubts = [_settled(_distinct(c), p, r) for c, p, r in zip(chains, pixels, ridges, strict=True)]
     doubts = [_confirmed(view, doubts, pixels) for view in (0, 1)]
+    if max(_others(line, r) for line, r in zip(pixels, ridges, strict=True)) <= _NEXT_TO_NOTHING:
+        doubts = [[_of_itself(doubt) for doubt in of_view] for of_view in doubts]
     for view, name in enumerate(("left", "right")):
         reasons += [
             f"{why} in the {name} view at ({scale * u:.0f}, {scale * v:.0f})"
@@ -186,6 +194,22 @@ def _is_shared(place: Float64, line: Float64, counterpart: Float64, chain: Float
     if not near.any() or len(chain) < 2:
         return False
     return coverage(chain, counterpart[near], _NEAR_PX) >= _AGREED
+
+
+def _others(line: Float64, ridges: Ridges) -> float:
+    """Length of all clear ridges away from a thread, (k, 2) pixels, against its own."""
+    points = np.concatenate(ridges.segments)
+    away = points[cKDTree(line).query(points)[0] > _BESIDE_PX]
+    level = _FAINT * float(np.median(ridges.sample(line)))
+    return int((ridges.sample(away) > level).sum()) / max(polyline_length(line), 1.0)
+
+
+def _of_itself(doubt: Doubt) -> Doubt:
+    """A doubt about where the thread goes on, of one that is alone: it meets nothing but itself."""
+    place, why, rest = doubt
+    if why in (CROSSING, SHARED):
+        rest = _ALONE * rest / (_ALONE * rest + 1 - rest)
+    return place, why, rest
 
 
 def _is_one_pass(line: Float64, near: Int64) -> bool:
