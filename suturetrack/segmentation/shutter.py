@@ -34,12 +34,11 @@ class Shutter:
             steps: (k,) px by which places of the thread moved across themselves between two frames.
             shown: (k,) whether the field shows them at the thread's own scale.
         """
-        classes = np.minimum((steps - SLOWEST_PX) / _WIDTH, _CLASSES - 1).astype(int)
         fast = steps >= SLOWEST_PX
         if fast.any():
+            classes = np.minimum((steps[fast] - SLOWEST_PX) / _WIDTH, _CLASSES - 1).astype(int)
             self._balance *= _KEPT_OF_A_SECOND ** (1 / 60)
-            balance = np.where(shown, 1.0, -1.0)[fast]
-            self._balance += np.bincount(classes[fast], balance, _CLASSES)
+            self._balance += np.bincount(classes, np.where(shown[fast], 1.0, -1.0), _CLASSES)
 
     @property
     def fastest_clear(self) -> float:
