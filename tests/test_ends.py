@@ -170,6 +170,28 @@ def test_a_loop_that_is_drawn_shut_moves_no_end() -> None:
     assert watch.length == pytest.approx(88.0, rel=1e-3)
 
 
+def test_a_detour_elsewhere_draws_no_end_in() -> None:
+    """A knot that is drawn tight may lead the curve astray, and its ends are where the images show them."""
+    watch, now = settled_watch(100.0)
+    length, drawn_in = 107.0, 0.0
+    for _ in range(30):
+        now += FRAME_NS
+        start, stop = watch.moves(step_at(0.2), step_at(0.1), length, now)
+        drawn_in -= (start + stop) * length
+        length *= 1.0 + start + stop
+    assert drawn_in < 2 * PIXEL * length
+
+
+def test_an_end_that_went_on_is_drawn_in_again() -> None:
+    """It goes on along a tool, as far as the thread was long, and gives back what that was too much."""
+    watch, now = settled_watch(100.0)
+    for length in (99.0, 101.0):
+        now += FRAME_NS
+        start, stop = watch.moves(step_at(0.0), step_at(10.0), length, now)
+        assert start == 0.0
+        assert length * (1.0 + stop) == pytest.approx(100.0)
+
+
 def test_an_end_that_steps_off_is_held_where_it_was() -> None:
     watch, now = settled_watch(100.0)
     start, stop = watch.moves(step_at(0.0), step_at(-30.0), 100.0, now + FRAME_NS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -222,6 +223,8 @@ class EndWatch:
         self.length = self._longest = self._steady = length
         self._before = before
         self._is_known = False
+        self._gone_on = [0.0, 0.0]
+        """By how much the ends have gone on of late."""
         self.settled = False
         """Whether the length has been steady for long enough to be the thread's own."""
         self.wanted = length
@@ -261,9 +264,15 @@ class EndWatch:
                 offsets[end] = 0.0
             else:
                 offsets[end] = min(max(lacking, -bound), bound)
+                if step is not None and step.offset_px > 0:
+                    # What is too long lies elsewhere, but for what either end has gone on.
+                    gone_on = self._gone_on[end] / length + max(offsets[1 - end], 0.0)
+                    gone_on += _LONGER_PX * step.pixel
+                    offsets[end] = max(offsets[end], min(-gone_on, 0.0))
         for end in (0, 1):
             if seen[end]:
                 self._seen_ns[end] = now_ns
+            self._gone_on[end] = self._fading(now_ns) * self._gone_on[end] + offsets[end] * length
         self.seen = seen[0], seen[1]
         self.at_border = any(step and step.at_border for step in steps)
         if doubted:
@@ -315,8 +324,12 @@ class EndWatch:
         self._is_known |= self.settled
         self.length = self._steady if self.settled else length
         if not self.at_border:
-            fading = np.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)
-            self._longest = max(length, length + (self._longest - length) * float(fading))
+            fading = self._fading(now_ns)
+            self._longest = max(length, length + (self._longest - length) * fading)
+
+    def _fading(self, now_ns: int) -> float:
+        """What is left of what was remembered at the last field."""
+        return math.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)
 
 
 def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:
