@@ -198,7 +198,7 @@ def _is_shared(place: Float64, line: Float64, counterpart: Float64, chain: Float
 
 def _others(line: Float64, ridges: Ridges) -> float:
     """Length of all clear ridges away from a thread, (k, 2) pixels, against its own."""
-    points = np.concatenate(ridges.segments)
+    points = np.concatenate([np.empty((0, 2)), *ridges.segments])
     away = points[cKDTree(line).query(points)[0] > _BESIDE_PX]
     level = _FAINT * float(np.median(ridges.sample(line)))
     return int((ridges.sample(away) > level).sum()) / max(polyline_length(line), 1.0)
