@@ -5,6 +5,9 @@ a vector h, one number a channel; everywhere else they scatter with a covariance
 w = C^-1 h is Fisher's mix: in no other does the thread stand out more from texture, noise, and the
 highlights that make h itself vary along the thread. In it the thread is dark.
 
+A highlight on wet tissue is white, and in a mix of differences, as of blue from red, may be as dark as
+the thread. Then the best of the mixes is taken in which it is not, where the thread stays clear there.
+
 What is learned is kept relative to the mean of each channel, so that it holds under another exposure
 and white balance, and in the other camera.
 """
@@ -46,6 +49,10 @@ _CLEAR = 0.7
 _BELOW = 0.8
 # A mix that is not better than gray by this factor is not worth its noise.
 _WORTH = 1.1
+# What of its distinctness a thread keeps, at least, in a mix that is blind to highlights: gray and violet
+# ones mostly do, blue and white ones do not.
+_KEPT = 0.8
+_WHITE = 255.0
 # Along a curve: how many windows are looked at, and half their width.
 _WINDOWS, _HALF_PX = 10, 32
 # Least cosine between two looks at one thread, or two places on it: 0.88 and more on one ground,
@@ -367,9 +374,30 @@ def _contrast(clutter: Float64, across: Float64, sigma: float, means: Float64) -
         shown = [middle @ w / math.sqrt(w @ total @ w) for w in (weights, gray)]
         if shown[0] < _WORTH * shown[1]:
             weights = gray
+        shadow = _SHADOW * means
+        nuisance = total + np.outer(shadow, shadow)
+        weights = _without_highlights(weights, middle, nuisance, _WHITE - means)
     weights = weights * means
     clutter = clutter / np.outer(means, means)
     return Contrast(weights / np.abs(weights).sum(), middle / means, clutter, sigma)
+
+
+def _without_highlights(
+    weights: Float64, middle: Float64, nuisance: Float64, highlight: Float64
+) -> Float64:
+    """The mix in which a `highlight`, (channels,) of grey levels above the ground, is not dark as well.
+
+    It is the best one of these for a thread with second derivatives `middle` among those of the
+    `nuisance`; the old mix where a highlight is far fainter, its second derivative about a third of
+    what it is darker, or where the thread itself is too much like one.
+    """
+    dark = -float(weights @ highlight)
+    if dark <= middle @ weights:
+        return weights
+    drawn = np.linalg.solve(nuisance, highlight)
+    blind = weights + dark / float(highlight @ drawn) * drawn
+    before, after = (middle @ w / math.sqrt(w @ nuisance @ w) for w in (weights, blind))
+    return blind if after > _KEPT * before else weights
 
 
 def _dark_ridge(scene: _Scene, weights: Float64, start: tuple[int, int]) -> _Ridge | None:

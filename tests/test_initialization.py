@@ -12,6 +12,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
 from suturetrack.initialization.depth import Depth
+from suturetrack.initialization.ends import read_end
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.segments import find_ridges, split_at_touches
 from suturetrack.initialization.strands import Strands
@@ -610,6 +611,33 @@ def test_views_that_disagree_lower_the_confidence(
     unsure = initialize(field_of(whole[0], part, rig), rig, Seed(pixel=tuple(left[700])))
     assert unsure.confidence < 0.5 < sure.confidence
     assert any("agree" in reason for reason in unsure.reasons)
+
+
+def test_a_view_of_noise_that_shows_no_ridge_at_all_lowers_the_confidence(
+    rig: StereoRig, curve: Nurbs
+) -> None:
+    field = field_of_curve(curve, rig)
+    seed = Seed(pixel=tuple(rig.project(dense(curve))[0][700]))
+    clear = initialize(field, rig, seed)
+    rng = np.random.default_rng(0)
+    right = np.where(field.right, field.right, rng.normal(0, 0.1, field.right.shape))
+    noisy = RidgeField(STAMP, field.left, right.astype(np.float32))
+    assert not find_ridges(noisy.right, InitializationConfig()).segments
+    found = initialize(noisy, rig, seed)
+    assert curve_error(dense(found.curve), dense(curve)).mean < 1.0
+    assert found.confidence < clear.confidence
+
+
+@pytest.mark.parametrize(("scenario", "seed"), [("pull-through", 1104), ("pull-through", 1111)])
+def test_a_thread_ends_where_it_goes_into_a_hole(scenario: str, seed: int) -> None:
+    """The hole responds as a thread does, but is wider."""
+    scene = open_scene(scenario, seed)
+    field, _ = field_and_seed(scene)
+    points = scene.truth(0)[0].points
+    for view, pixels in zip((field.left, field.right), scene.rig.project(points), strict=True):
+        fine = np.linspace(0, len(pixels) - 1, round(polyline_length(pixels)))
+        chain = np.c_[[np.interp(fine, np.arange(len(pixels)), c) for c in pixels.T]].T
+        assert abs(read_end(view, chain).offset_px) < 1.2
 
 
 @pytest.mark.parametrize("baseline", [0.04, 4000.0])

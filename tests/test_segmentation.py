@@ -623,6 +623,22 @@ def test_what_varies_along_the_thread_counts() -> None:
     assert min(np.mean(stretch) for stretch in stretches) > 0.2
 
 
+@pytest.mark.parametrize("number", [1150, 1153])
+def test_a_highlight_is_not_dark_where_the_thread_is(number: int) -> None:
+    """Of a dark gray thread on wet red tissue, blue less red would show both alike."""
+    scene = open_scene("leaves-view", number)
+    field = learned_field(scene, Seed(pixel=scene.seed_pixel()), SegmentationConfig())
+    u, v = np.rint(scene.rig.project(scene.truth(0)[0].points)[0]).astype(int).T
+    inside = (u >= 0) & (v >= 0) & (u < field.shape[1]) & (v < field.shape[0])
+    u, v = u[inside], v[inside]
+    away = np.ones(field.shape[:2], np.uint8)
+    away[v, u] = 0
+    is_white = (scene.render(0)[0].min(axis=2) > 225) & (cv2.erode(away, np.ones((21, 21))) > 0)
+    assert np.count_nonzero(is_white) > 50
+    shown = np.linalg.norm(field, axis=-1)
+    assert np.quantile(shown[is_white], 0.9) < 0.25 * np.median(shown[v, u])
+
+
 @pytest.mark.parametrize("light", [(1.6, 1.0, 0.45), (0.55, 0.8, 1.15), (0.4, 0.4, 0.4)])
 def test_another_exposure_and_white_balance_show_the_same(
     scene: Scene, light: tuple[float, float, float]

@@ -41,6 +41,8 @@ __all__ = [
 
 
 _SHORTEST_STEPS = 4
+_FAINT = 0.15
+"""Share of the thread's response below which nothing is shown of its ends."""
 _LEAST_MATCH = 0.35
 """Median response of the right view, against the left one, below which it shows another scene."""
 
@@ -164,7 +166,7 @@ def _reconstruct(
     if not _is_matched(found.matched):
         swapped = match(found.left.chain, field.left, field.right, nearest, -1)
         raise InitializationError(_no_match(swapped), candidates, growth)
-    pixels = _trim(pixels, field)
+    pixels = _trim(pixels, left)
     s = image_parameters(pixels[:, :2], pixels[:, 2:])
     points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
     curve = fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
@@ -211,10 +213,13 @@ def seed_pixel(seed: Seed, rig: StereoRig) -> Float64:
     return pixel
 
 
-def _trim(pixels: Float64, field: RidgeField) -> Float64:
+def _trim(pixels: Float64, left: Ridges) -> Float64:
     """Moves both ends of the (k, 4) chain, left and right pixels, to where the left thread ends."""
+    shown = left.sample(pixels[:, :2])
+    inside = np.flatnonzero(shown >= _FAINT * np.median(shown))
+    pixels = pixels[inside[0] : inside[-1] + 1]
     for _ in (0, 1):
-        reading = read_end(field.left, pixels[:, :2])
+        reading = read_end(left.field, pixels[:, :2])
         if np.isfinite(reading.offset_px):
             pixels = move_end(pixels, reading.offset_px)
         pixels = pixels[::-1]

@@ -73,14 +73,23 @@ def find_crest(view: View, pixels: Float64) -> Crest:
     around = np.arange(-_CENTROID_REACH, _CENTROID_REACH + 1)
     index = np.clip(peak[:, None] + around, 0, len(_OFFSETS) - 1)
     window = np.take_along_axis(profiles, index, 1)
-    window = np.maximum(window - window.min(1, keepdims=True), 0) ** 2
-    total = window.sum(1)
-    seen = (peak > 0) & (peak < len(_OFFSETS) - 1) & (total > 0)
-    offsets = (window * _OFFSETS[index]).sum(1) / np.maximum(total, 1e-12)
-    spread = (window * (_OFFSETS[index] - offsets[:, None]) ** 2).sum(1) / np.maximum(total, 1e-12)
+    seen = (peak > 0) & (peak < len(_OFFSETS) - 1) & (np.ptp(window, axis=1) > 0)
+    offsets, spread = moments(window, _OFFSETS[index])
     usual = float(np.median(spread[seen])) if seen.any() else 1.0
-    wider = np.maximum(spread / max(_WIDE * usual, 1e-12), 1.0)
     heights = np.take_along_axis(profiles, peak[:, None], 1)[:, 0]
     normals = np.c_[-tangents[:, 1], tangents[:, 0]]
-    clear = wider**-_WIDENED * view.clear(pixels)
+    clear = single(spread, usual) * view.clear(pixels)
     return Crest(normals, np.where(seen, offsets, 0.0), np.where(seen, heights, 0.0), clear)
+
+
+def moments(profiles: Float64, offsets: Float64) -> tuple[Float64, Float64]:
+    """(k,) middle and squared width of a ridge, px, from (k, m) responses across it at the offsets."""
+    weights = np.maximum(profiles - profiles.min(1, keepdims=True), 0) ** 2
+    total = np.maximum(weights.sum(1), 1e-12)
+    middle = (weights * offsets).sum(1) / total
+    return middle, (weights * (offsets - middle[:, None]) ** 2).sum(1) / total
+
+
+def single(spread: Float64, usual: float) -> Float64:
+    """(k,) in [0, 1]: low where a ridge of this squared width is more than one strand."""
+    return np.maximum(spread / max(_WIDE * usual, 1e-12), 1.0) ** -_WIDENED

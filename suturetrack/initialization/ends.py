@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from suturetrack.initialization.crest import moments, single
 from suturetrack.kernels import search
 from suturetrack.types import Float32, Float64
 
@@ -17,7 +18,11 @@ _END_LEVEL = 0.4
 widths, where it lies within 0.4 px of the true end."""
 _STAYS_PX = 3.0
 """How long the response has to stay below, so that a highlight does not end the thread."""
-_BESIDE = np.arange(-1.0, 1.01, 0.5)
+_ACROSS = np.arange(-4.0, 4.01, 0.5)
+"""Where the ridge is looked at across itself, px."""
+_MIDDLE = np.abs(_ACROSS) <= 1
+_HOLE_PX = 4.0
+"""How far a ridge may run on as something wider that the thread goes into."""
 _BORDER_PX = 3.0
 
 
@@ -42,19 +47,30 @@ def read_end(field: Float32, pixels: Float64) -> EndReading:
     places = np.where(x[:, None] <= 0, inside, pixels[0] + x[:, None] * outward)
     tangents = np.gradient(places, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    response = search.normal_profiles(field, places, tangents, _BESIDE, 0.0).max(1)
+    profiles = search.normal_profiles(field, places, tangents, _ACROSS, 0.0)
+    response = profiles[:, _MIDDLE].max(1)
     level = _END_LEVEL * float(np.median(response[x < -4]))
     run = int(_STAYS_PX / _STEP_PX)
     later = np.convolve(response, np.ones(run) / run)[run - 1 :]
     below = np.flatnonzero((response < level) & (later < level) & (x > -_INSIDE_PX + 4))
     if level <= 0 or len(below) == 0:
         return EndReading(np.nan, _leaves(pixels[0] + _OUTSIDE_PX * outward, field))
-    k = int(below[0])
-    drop = max(float(response[k - 1] - response[k]), 1e-9)
-    offset = float(x[k]) - _STEP_PX * float(level - response[k]) / drop
+    offset = _falls(x, response, int(below[0]), level)
+    _, spread = moments(profiles, _ACROSS)
+    narrow = response * single(spread, float(np.median(spread[x < -4])))
+    solid = np.flatnonzero(narrow >= level)
+    if len(solid) and solid[-1] + 1 < len(x):
+        before = _falls(x, narrow, int(solid[-1]) + 1, level)
+        offset = before if offset - _HOLE_PX <= before < offset else offset
     if _leaves(pixels[0] + offset * outward, field):
         return EndReading(np.nan, True)
     return EndReading(offset, False)
+
+
+def _falls(x: Float64, response: Float64, k: int, level: float) -> float:
+    """Where the response falls to the level, just before the place `k`."""
+    drop = max(float(response[k - 1] - response[k]), 1e-9)
+    return float(x[k]) - _STEP_PX * float(level - response[k]) / drop
 
 
 def move_end(pixels: Float64, offset_px: float) -> Float64:
