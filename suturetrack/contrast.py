@@ -6,7 +6,8 @@ w = C^-1 h is Fisher's mix: in no other does the thread stand out more from text
 highlights that make h itself vary along the thread. In it the thread is dark.
 
 A highlight on wet tissue is white, and in a mix of differences, as of blue from red, may be as dark as
-the thread. Then the best of the mixes is taken in which it is not, where the thread stays clear there.
+the thread. Where there are some, the best of the mixes is taken in which they are not, if the thread stays
+clear in that one.
 
 What is learned is kept relative to the mean of each channel, so that it holds under another exposure
 and white balance, and in the other camera.
@@ -49,10 +50,13 @@ _CLEAR = 0.7
 _BELOW = 0.8
 # A mix that is not better than gray by this factor is not worth its noise.
 _WORTH = 1.1
-# What of its distinctness a thread keeps, at least, in a mix that is blind to highlights: gray and violet
-# ones mostly do, blue and white ones do not.
-_KEPT = 0.8
-_WHITE = 255.0
+# What of its distinctness a thread keeps, at least, in a mix that is blind to highlights: white ones do not.
+_KEPT = 0.667
+# A highlight's second derivative is about a third of what it differs from the ground; below 0.4 of the
+# thread's, an end is seen before it.
+_FAINTER = 1.2
+# Grey levels of a highlight in every channel, and the share of the picture below which there are none.
+_WHITE, _SCARCE = 225, 2e-4
 # Along a curve: how many windows are looked at, and half their width.
 _WINDOWS, _HALF_PX = 10, 32
 # Least cosine between two looks at one thread, or two places on it: 0.88 and more on one ground,
@@ -144,7 +148,7 @@ def contrast_at(image: Image, pixel: tuple[float, float]) -> Contrast | None:
     ridge = _Ridge(zoom * best.ridge.pixels + seed, best.ridge.normals)
     across = _of_one_thread(scene, ridge, seed)
     clutter = scene.clutter_near(seed, zoom * _NEAR_PX)
-    return _contrast(clutter, across, sigma * 2**octave, channel_means(image))
+    return _contrast(clutter, across, sigma * 2**octave, image)
 
 
 def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
@@ -168,7 +172,7 @@ def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
         across.append(ridge.across(scene))
         clutter.append(scene.clutter)
     middle = np.concatenate(across)
-    return _contrast(np.mean(clutter, axis=0), middle, sigma, channel_means(image))
+    return _contrast(np.mean(clutter, axis=0), middle, sigma, image)
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,8 +366,9 @@ def _of_one_thread(scene: _Scene, ridge: _Ridge, seed: Float64) -> Float64:
     return across[alike] if np.count_nonzero(alike) >= _SHORTEST_PX else across
 
 
-def _contrast(clutter: Float64, across: Float64, sigma: float, means: Float64) -> Contrast:
+def _contrast(clutter: Float64, across: Float64, sigma: float, image: Image) -> Contrast:
     """From the (channels, channels) clutter and (N, channels) derivatives across, grey levels."""
+    means = channel_means(image)
     middle, weights = np.median(across, axis=0), _fisher(clutter, across)
     if len(weights) == 1:
         weights, middle, clutter = weights * GRAY, np.repeat(middle, 3), np.full((3, 3), clutter)
@@ -374,12 +379,20 @@ def _contrast(clutter: Float64, across: Float64, sigma: float, means: Float64) -
         shown = [middle @ w / math.sqrt(w @ total @ w) for w in (weights, gray)]
         if shown[0] < _WORTH * shown[1]:
             weights = gray
-        shadow = _SHADOW * means
-        nuisance = total + np.outer(shadow, shadow)
-        weights = _without_highlights(weights, middle, nuisance, _WHITE - means)
+        highlight, shadow = _highlight(image, means), _SHADOW * means
+        if highlight is not None:
+            nuisance = total + np.outer(shadow, shadow)
+            weights = _without_highlights(weights, middle, nuisance, highlight)
     weights = weights * means
     clutter = clutter / np.outer(means, means)
     return Contrast(weights / np.abs(weights).sum(), middle / means, clutter, sigma)
+
+
+def _highlight(image: Image, means: Float64) -> Float64 | None:
+    """(3,) by how much brighter than the ground the highlights are, grey levels; None without any."""
+    pixels = image[::4, ::4].reshape(-1, 3)
+    white = pixels[pixels.min(axis=1) >= _WHITE]
+    return white.mean(axis=0) - means if len(white) > _SCARCE * len(pixels) else None
 
 
 def _without_highlights(
@@ -388,11 +401,10 @@ def _without_highlights(
     """The mix in which a `highlight`, (channels,) of grey levels above the ground, is not dark as well.
 
     It is the best one of these for a thread with second derivatives `middle` among those of the
-    `nuisance`; the old mix where a highlight is far fainter, its second derivative about a third of
-    what it is darker, or where the thread itself is too much like one.
+    `nuisance`; the old mix where a highlight is fainter, or the thread too much like one.
     """
     dark = -float(weights @ highlight)
-    if dark <= middle @ weights:
+    if dark <= _FAINTER * middle @ weights:
         return weights
     drawn = np.linalg.solve(nuisance, highlight)
     blind = weights + dark / float(highlight @ drawn) * drawn
