@@ -18,9 +18,11 @@ _END_LEVEL = 0.4
 widths, where it lies within 0.4 px of the true end."""
 _STAYS_PX = 3.0
 """How long the response has to stay below, so that a highlight does not end the thread."""
+_BESIDE = np.arange(-1.0, 1.01, 0.5)
 _ACROSS = np.arange(-4.0, 4.01, 0.5)
 """Where the ridge is looked at across itself, px."""
-_MIDDLE = np.abs(_ACROSS) <= 1
+_ALONE_PX = (-24.0, -4.0)
+"""Where the ridge is as wide as the thread alone, px beyond the end."""
 _HOLE_PX = 4.0
 """How far a ridge may run on as something wider that the thread goes into."""
 _BORDER_PX = 3.0
@@ -47,30 +49,57 @@ def read_end(field: Float32, pixels: Float64) -> EndReading:
     places = np.where(x[:, None] <= 0, inside, pixels[0] + x[:, None] * outward)
     tangents = np.gradient(places, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    profiles = search.normal_profiles(field, places, tangents, _ACROSS, 0.0)
-    response = profiles[:, _MIDDLE].max(1)
+    response = search.normal_profiles(field, places, tangents, _BESIDE, 0.0).max(1)
     level = _END_LEVEL * float(np.median(response[x < -4]))
     run = int(_STAYS_PX / _STEP_PX)
     later = np.convolve(response, np.ones(run) / run)[run - 1 :]
     below = np.flatnonzero((response < level) & (later < level) & (x > -_INSIDE_PX + 4))
     if level <= 0 or len(below) == 0:
         return EndReading(np.nan, _leaves(pixels[0] + _OUTSIDE_PX * outward, field))
-    offset = _falls(x, response, int(below[0]), level)
-    _, spread = moments(profiles, _ACROSS)
-    narrow = response * single(spread, float(np.median(spread[x < -4])))
-    solid = np.flatnonzero(narrow >= level)
-    if len(solid) and solid[-1] + 1 < len(x):
-        before = _falls(x, narrow, int(solid[-1]) + 1, level)
-        offset = before if offset - _HOLE_PX <= before < offset else offset
+    offset = falls_below(x, response, int(below[0]), level)
+    narrow = response * narrowness(field, places, tangents, x)
+    offset = before_a_hole(x, narrow, level, offset)
     if _leaves(pixels[0] + offset * outward, field):
         return EndReading(np.nan, True)
     return EndReading(offset, False)
 
 
-def _falls(x: Float64, response: Float64, k: int, level: float) -> float:
-    """Where the response falls to the level, just before the place `k`."""
+def narrowness(field: Float32, pixels: Float64, tangents: Float64, x: Float64) -> Float64:
+    """(k,) in [0, 1]: low where the ridge is wider than that of the thread.
+
+    Args:
+        field: (H, W, 2).
+        pixels: (k, 2) along the thread and its extension.
+        tangents: (k, 2), unit.
+        x: (k,) px beyond the end.
+    """
+    profiles = search.normal_profiles(field, pixels, tangents, _ACROSS, 0.0)
+    _, spread = moments(profiles, _ACROSS)
+    inner, outer = _ALONE_PX
+    alone = spread[(x >= inner) & (x < outer)]
+    return single(spread, float(np.median(alone))) if len(alone) else np.ones(len(x))
+
+
+def before_a_hole(x: Float64, narrow: Float64, level: float, end: float) -> float:
+    """The end, or where the thread goes into something wider just before it.
+
+    Args:
+        x: (k,) px along the thread and beyond it, evenly spaced.
+        narrow: (k,) responses, low where the ridge is wider than the thread.
+        level: response at which the thread ends.
+        end: where all of the ridge ends.
+    """
+    shown = np.flatnonzero(narrow >= level)
+    if len(shown) == 0 or shown[-1] + 1 == len(x):
+        return end
+    hole = falls_below(x, narrow, int(shown[-1]) + 1, level)
+    return hole if end - _HOLE_PX <= hole < end else end
+
+
+def falls_below(x: Float64, response: Float64, k: int, level: float) -> float:
+    """Where the response falls to the level, just before the place `k` of an even `x`."""
     drop = max(float(response[k - 1] - response[k]), 1e-9)
-    return float(x[k]) - _STEP_PX * float(level - response[k]) / drop
+    return float(x[k] - (x[1] - x[0]) * (level - response[k]) / drop)
 
 
 def move_end(pixels: Float64, offset_px: float) -> Float64:

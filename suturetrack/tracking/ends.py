@@ -9,18 +9,13 @@ import numpy as np
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization.crest import moments, single
+from suturetrack.initialization.ends import before_a_hole, narrowness
 from suturetrack.kernels import search
 from suturetrack.tracking.sampling import View, distinct, values_at, views
-from suturetrack.types import Float32, Float64, Nurbs, RidgeField
+from suturetrack.types import Float64, Nurbs, RidgeField
 
 _STEP_PX = 0.5
 _INWARD_PX, _OUTWARD_PX = 40.0, 10.0
-_ACROSS_PX = np.arange(-4.0, 4.01, 0.5)
-# Where the width of the ridge is that of the thread alone, px inward.
-_ALONE_PX = (24.0, 4.0)
-# How far a ridge may run on as something wider that the thread goes into.
-_HOLE_PX = 4.0
 # What eq. (1) leaves of the response at the very end of a ridge.
 _AT_THE_END = 0.43
 # Before and behind a plain end the response takes so far to fall from and to these parts; it takes
@@ -70,19 +65,24 @@ def find_end(
     None where there is no thread near the end.
     """
     scale = _px_per_s(curve, end, rig)
-    x, both, responses, narrow = _profiles(curve, end, field, rig, levels, scale)
+    x, both, responses = _profiles(curve, end, field, rig, levels, scale)
     inside = both[0].inside(rig.image_size) & both[1].inside(rig.image_size)
     if not inside.any():
         return None
+    narrow = [
+        response * narrowness(image, view.pixels, view.tangents, x)
+        for image, view, response in zip((field.left, field.right), both, responses, strict=True)
+    ]
     x, mean, least, alone = (
         x[inside],
         _smooth(np.mean(responses, axis=0)[inside]),
         np.min(responses, axis=0)[inside],
         _smooth(np.mean(narrow, axis=0)[inside]),
     )
-    boundary = _outer_boundary(x, mean, np.minimum(_smooth(least) + 0.15, mean), alone)
-    if boundary is None:
+    found = _outer_boundary(x, mean, np.minimum(_smooth(least) + 0.15, mean))
+    if found is None:
         return None
+    boundary = before_a_hole(x, alone, found[1], found[0])
     at_border = not inside.all() and boundary > x[-1] - 3
     return EndStep(boundary, 1 / scale, at_border)
 
@@ -103,17 +103,15 @@ def end_shift(
         where the views do not both show the end.
     """
     scale = _px_per_s(curve, end, rig)
-    x, both, responses, narrow = _profiles(curve, end, field, rig, levels, scale)
+    x, both, responses = _profiles(curve, end, field, rig, levels, scale)
     tip = int(np.searchsorted(x, 0.0))
     shown, rows = [], []
-    for view, response, alone in zip(both, responses, narrow, strict=True):
-        if not view.inside(rig.image_size).all():
-            return None
+    for view, response in zip(both, responses, strict=True):
         smooth = _smooth(response)
-        boundary = _outer_boundary(x, smooth, smooth, _smooth(alone))
-        if boundary is None or abs(boundary) > _SHOWN_PX:
+        found = _outer_boundary(x, smooth, smooth) if view.inside(rig.image_size).all() else None
+        if found is None or abs(found[0]) > _SHOWN_PX:
             return None
-        shown.append(boundary)
+        shown.append(found[0])
         rows.append(view.tangents[tip] @ view.jacobian[tip] / view.speed[tip])
     outward = scale if end else -scale
     return shown[1] - shown[0], outward * (rows[1] - rows[0])
@@ -126,29 +124,15 @@ def _profiles(
     rig: StereoRig,
     levels: tuple[float, float],
     scale: float,
-) -> tuple[Float64, tuple[View, View], list[Float64], list[Float64]]:
-    """(k,) px beyond the end, the curve there in both images, their (k,) responses, and what of them
-    is as narrow as the thread."""
+) -> tuple[Float64, tuple[View, View], list[Float64]]:
+    """(k,) px beyond the end, the curve there in both images, and their (k,) responses."""
     x = np.arange(-min(_INWARD_PX, 0.5 * scale), _OUTWARD_PX + 0.1, _STEP_PX)
     both = views(rig, *_extension(curve, end, np.asarray(x / scale, np.float64)))
     responses = [
         np.minimum(search.responses(image, view.pixels, view.tangents) / level, 1.2)
         for image, view, level in zip((field.left, field.right), both, levels, strict=True)
     ]
-    narrow = [
-        response * _narrowness(image, view, x)
-        for image, view, response in zip((field.left, field.right), both, responses, strict=True)
-    ]
-    return x, both, responses, narrow
-
-
-def _narrowness(image: Float32, view: View, x: Float64) -> Float64:
-    """(k,) in [0, 1]: low where the ridge is wider than that of the thread."""
-    profiles = search.normal_profiles(image, view.pixels, view.tangents, _ACROSS_PX, 0.0)
-    _, spread = moments(profiles, _ACROSS_PX)
-    far, near = _ALONE_PX
-    alone = spread[(x >= -far) & (x < -near)]
-    return single(spread, float(np.median(alone))) if len(alone) else np.ones(len(x))
+    return x, both, responses
 
 
 def _smooth(profile: Float64) -> Float64:
@@ -156,11 +140,11 @@ def _smooth(profile: Float64) -> Float64:
     return np.convolve(padded, np.full(5, 0.2), mode="valid")
 
 
-def _outer_boundary(x: Float64, mean: Float64, least: Float64, narrow: Float64) -> float | None:
-    """Where the outermost solid run that begins on the curve ends, to a part of a pixel.
+def _outer_boundary(x: Float64, mean: Float64, least: Float64) -> tuple[float, float] | None:
+    """Where the outermost solid run that begins on the curve ends, to a part of a pixel, and the response
+    there.
 
-    The thread may fade towards its end: the step is looked for at a part of what it shows there. A hole
-    that it goes into is wider than it.
+    The thread may fade towards its end: the step is looked for at a part of what it shows there.
     """
     runs = search.solid((x <= 0) & (mean > _FAINT), np.full(len(x), _STEP_PX), _SOLID_PX)
     if not runs.any():
@@ -178,15 +162,11 @@ def _outer_boundary(x: Float64, mean: Float64, least: Float64, narrow: Float64) 
     ):
         last += 1
     if last + 1 == len(x):
-        return float(x[-1])
+        return float(x[-1]), threshold
     end = _crossing(x, mean, last, threshold)
     if mean[last + 1] < threshold:
         end -= _softness(x, mean / plateau, last, end)
-    alone = np.flatnonzero(narrow >= threshold)
-    if len(alone) and alone[-1] + 1 < len(x):
-        hole = _crossing(x, narrow, int(alone[-1]), threshold)
-        end = hole if end - _HOLE_PX <= hole < end else end
-    return end
+    return end, threshold
 
 
 def _softness(x: Float64, mean: Float64, last: int, end: float) -> float:
