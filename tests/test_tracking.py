@@ -617,7 +617,7 @@ def test_a_thread_is_followed_in_the_field_of_its_own(rig: StereoRig) -> None:
         tracker, errors = Tracker(rig), []
         for i in range(60):
             lift = 3.0 * abs(np.cos(2 * np.pi * i / 60))
-            pair = [np.c_[sign * (0.03 * y + lift), y, np.full(400, 200.0)] for sign in (-1, 1)]
+            pair = [np.c_[sign * (0.02 * y + lift), y, np.full(400, 200.0)] for sign in (-1, 1)]
             field = paint(rig, pair, i)
             own = {name: paint(rig, [points], i) for name, points in zip("ab", pair, strict=True)}
             if apart:
@@ -629,7 +629,7 @@ def test_a_thread_is_followed_in_the_field_of_its_own(rig: StereoRig) -> None:
             errors += [error(s, t).p95 for s, t in zip(states, pair, strict=True)]
         worst[apart] = max(errors)
     assert worst[True] < 0.15
-    assert worst[False] > 1.5 * worst[True]
+    assert worst[False] > 3 * worst[True]
 
 
 def test_an_end_beneath_another_thread_is_no_shorter(rig: StereoRig) -> None:
