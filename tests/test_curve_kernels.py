@@ -12,6 +12,8 @@ from numba.core.dispatcher import Dispatcher
 from suturetrack import kernels, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import rows, search, spline
+from suturetrack.kernels.boundary import outer_boundary
+from tests.reference import boundary as boundary_reference
 from tests.reference import curve_fit as reference
 from tests.reference import strands as strands_reference
 
@@ -47,6 +49,14 @@ def test_points_and_their_transpose_agree_with_dense_matrices() -> None:
     control, points = RNG.normal(size=(9, 3)), RNG.normal(size=(len(S), 2))
     np.testing.assert_allclose(spline.combine(first, table[0], control), a @ control, atol=1e-12)
     np.testing.assert_allclose(spline.gather(first, table[0], points), a.T @ points, atol=1e-12)
+
+
+def test_a_curve_is_evaluated_as_by_dense_matrices() -> None:
+    control = RNG.normal(size=(9, 3))
+    values = spline.evaluate(S, KNOTS, control)
+    for times in range(3):
+        expected = reference.design(S, KNOTS, times) @ control
+        np.testing.assert_allclose(values[times], expected, atol=1e-7)
 
 
 def test_banded_least_squares_is_dense_least_squares() -> None:
@@ -178,6 +188,21 @@ def test_short_runs_are_dropped() -> None:
     flags = np.array([1, 1, 0, 1, 1, 1, 0, 1], bool)
     kept = search.solid(flags, np.full(8, 2.0), 5.0)
     np.testing.assert_array_equal(kept, [0, 0, 0, 1, 1, 1, 0, 0])
+
+
+@given(st.integers(0, 10_000))
+def test_a_thread_ends_where_the_twin_has_it_end(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x = np.arange(-40.0, 10.1, 0.5)
+    end, softness, fading = rng.uniform(-30, 12), rng.uniform(0.3, 4), rng.uniform(0, 0.02)
+    mean = (1 + fading * x) / (1 + np.exp((x - end) / softness)) + 0.1 * rng.normal(size=len(x))
+    mean *= rng.choice([0.0, 0.3, 1.0])
+    mean[rng.integers(0, len(x), 4)] = 0.0
+    least = mean - rng.uniform(0, 0.3)
+    found, expected = (
+        f(x, mean, least) for f in (outer_boundary, boundary_reference.outer_boundary)
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def random_strand(rng: np.random.Generator, count: int) -> strands_reference.Strand:

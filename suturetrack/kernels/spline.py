@@ -87,6 +87,16 @@ def combine(first: Int64, values: Float64, control_points: Float64) -> Float64:
 
 
 @numba.njit(cache=True, nogil=True)
+def evaluate(s: Float64, knots: Float64, control_points: Float64) -> Float64:
+    """(3, k, dim) points of a cubic curve at (k,) parameters, with their first and second derivatives."""
+    first, table = local_basis(s, knots)
+    values = np.empty((len(table), len(s), control_points.shape[1]))
+    for times in range(len(table)):
+        values[times] = combine(first, table[times], control_points)
+    return values
+
+
+@numba.njit(cache=True, nogil=True)
 def even_samples(knots: Float64, count: int) -> tuple[Float64, Float64]:
     """`count` parameters evenly within each knot span, clear of the knots, and their shares of [0, 1]."""
     spans = 0

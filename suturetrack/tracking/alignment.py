@@ -7,7 +7,7 @@ import numpy as np
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.nurbs import curve_from
-from suturetrack.tracking.sampling import View, values_at, views
+from suturetrack.tracking.sampling import View, views_at
 from suturetrack.types import Float32, Float64, Nurbs, RidgeField
 
 _PLACES = 40
@@ -25,7 +25,7 @@ def shifted(curve: Nurbs, field: RidgeField, rig: StereoRig, levels: tuple[float
         levels: response of a clear view of the thread, left and right.
     """
     s = np.linspace(0, 1, _PLACES)
-    both = views(rig, values_at(curve, s), values_at(curve, s, 1))
+    both = views_at(rig, curve, s)
     best: Float64 = np.zeros(2)
     for reach, step in _GRIDS_PX:
         steps = np.arange(-reach, reach + step / 2, step)
@@ -40,7 +40,7 @@ def shifted(curve: Nurbs, field: RidgeField, rig: StereoRig, levels: tuple[float
 def shown(curve: Nurbs, field: RidgeField, rig: StereoRig, levels: tuple[float, float]) -> float:
     """How much of the thread the images show where the curve is, in [0, 1]."""
     s = np.linspace(0, 1, _PLACES)
-    both = views(rig, values_at(curve, s), values_at(curve, s, 1))
+    both = views_at(rig, curve, s)
     return float(_shown(both, np.zeros((1, 2)), (field.left, field.right), levels)[0])
 
 

@@ -6,30 +6,26 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.ends import before_a_hole, narrowness
 from suturetrack.kernels import search
-from suturetrack.tracking.sampling import View, distinct, values_at, views
+from suturetrack.kernels.boundary import outer_boundary
+from suturetrack.tracking.sampling import View, derivatives_at, distinct, views, views_at
 from suturetrack.types import Float64, Nurbs, RidgeField
 
 _STEP_PX = 0.5
 _INWARD_PX, _OUTWARD_PX = 40.0, 10.0
-# What eq. (1) leaves of the response at the very end of a ridge.
-_AT_THE_END = 0.43
-# Before and behind a plain end the response takes so far to fall from and to these parts; it takes
-# longer behind an end at something dark, and so much is taken back at most.
-_BEFORE, _BEHIND, _SYMMETRY = 0.7, 0.15, 1.12
-_SOFTEST_PX = 2.0
+# Samples of whose responses the mean is taken.
+_SMOOTHED = 5
+# Where the curve tells how long a pixel is.
+_ALONG = np.linspace(0, 1, 51)
 # An end that points along the line of sight is taken to be foreshortened to this part of the rest, at most.
 _FORESHORTENED = 0.5
-# Responses below this part of a clear view are background.
-_FAINT = 0.2
 # An end that a view shows further away than this from the curve's own is another one, or covered.
 _SHOWN_PX = 3.0
-# What is shorter than this is a speck behind the end and not its continuation.
-_SOLID_PX = 8.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +63,7 @@ def find_end(
     scale = _px_per_s(curve, end, rig)
     x, both, responses = _profiles(curve, end, field, rig, levels, scale)
     inside = both[0].inside(rig.image_size) & both[1].inside(rig.image_size)
-    if not inside.any():
+    if np.count_nonzero(inside) < _SMOOTHED:
         return None
     narrow = [
         response * narrowness(image, view.pixels, view.tangents, x)
@@ -79,10 +75,10 @@ def find_end(
         np.min(responses, axis=0)[inside],
         _smooth(np.mean(narrow, axis=0)[inside]),
     )
-    found = _outer_boundary(x, mean, np.minimum(_smooth(least) + 0.15, mean))
-    if found is None:
+    found, level = outer_boundary(x, mean, np.minimum(_smooth(least) + 0.15, mean))
+    if math.isnan(found):
         return None
-    boundary = before_a_hole(x, alone, found[1], found[0])
+    boundary = before_a_hole(x, alone, level, found)
     at_border = not inside.all() and boundary > x[-1] - 3
     return EndStep(boundary, 1 / scale, at_border)
 
@@ -108,10 +104,11 @@ def end_shift(
     shown, rows = [], []
     for view, response in zip(both, responses, strict=True):
         smooth = _smooth(response)
-        found = _outer_boundary(x, smooth, smooth) if view.inside(rig.image_size).all() else None
-        if found is None or abs(found[0]) > _SHOWN_PX:
+        found, _ = outer_boundary(x, smooth, smooth)
+        # Not where it is nan, either.
+        if not (view.inside(rig.image_size).all() and abs(found) <= _SHOWN_PX):
             return None
-        shown.append(found[0])
+        shown.append(found)
         rows.append(view.tangents[tip] @ view.jacobian[tip] / view.speed[tip])
     outward = scale if end else -scale
     return shown[1] - shown[0], outward * (rows[1] - rows[0])
@@ -136,59 +133,7 @@ def _profiles(
 
 
 def _smooth(profile: Float64) -> Float64:
-    padded = np.r_[profile[[0, 0]], profile, profile[[-1, -1]]]
-    return np.convolve(padded, np.full(5, 0.2), mode="valid")
-
-
-def _outer_boundary(x: Float64, mean: Float64, least: Float64) -> tuple[float, float] | None:
-    """Where the outermost solid run that begins on the curve ends, to a part of a pixel, and the response
-    there.
-
-    The thread may fade towards its end: the step is looked for at a part of what it shows there.
-    """
-    runs = search.solid((x <= 0) & (mean > _FAINT), np.full(len(x), _STEP_PX), _SOLID_PX)
-    if not runs.any():
-        return None
-    last = int(np.flatnonzero(runs)[-1])
-    plateau = float(np.median(mean[max(last - 24, 0) : last - 6]))
-    threshold = _AT_THE_END * plateau
-    while last > 0 and mean[last] < threshold:
-        last -= 1
-    beyond = max(threshold, _FAINT)
-    while (
-        last + 1 < len(x)
-        and mean[last + 1] >= threshold
-        and (x[last + 1] <= 0 or least[last + 1] >= beyond)
-    ):
-        last += 1
-    if last + 1 == len(x):
-        return float(x[-1]), threshold
-    end = _crossing(x, mean, last, threshold)
-    if mean[last + 1] < threshold:
-        end -= _softness(x, mean / plateau, last, end)
-    return end, threshold
-
-
-def _softness(x: Float64, mean: Float64, last: int, end: float) -> float:
-    """How much further the response falls behind the end than before it, px.
-
-    A hole that the thread comes out of, or a shadow that it casts, responds as well, and draws the end
-    outward. Blur is the same on both sides.
-    """
-    before = behind = last
-    while before > 0 and mean[before] < _BEFORE:
-        before -= 1
-    while behind + 2 < len(x) and mean[behind + 1] >= _BEHIND:
-        behind += 1
-    rise = end - _crossing(x, mean, before, _BEFORE)
-    fall = _crossing(x, mean, behind, _BEHIND) - end
-    return min(max(fall - _SYMMETRY * rise, 0.0), _SOFTEST_PX)
-
-
-def _crossing(x: Float64, mean: Float64, last: int, level: float) -> float:
-    """Where the response falls to the level behind the sample `last`."""
-    share = (mean[last] - level) / max(float(mean[last] - mean[last + 1]), 1e-6)
-    return float(x[last] + _STEP_PX * min(max(share, 0.0), 1.0))
+    return np.asarray(uniform_filter1d(profile, _SMOOTHED, mode="nearest"))
 
 
 # What the length of a thread may change by from one field to the next.
@@ -343,9 +288,8 @@ class EndWatch:
 
 
 def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:
-    s = np.linspace(0, 1, 51)
-    both = views(rig, values_at(curve, s), values_at(curve, s, 1))
-    speed = np.mean([view.speed for view in both], axis=0)
+    left, right = views_at(rig, curve, _ALONG)
+    speed = (left.speed + right.speed) / 2
     at_end = speed[-2:].mean() if end else speed[:2].mean()
     return max(float(at_end), _FORESHORTENED * float(speed.mean()), 1e-6)
 
@@ -355,9 +299,9 @@ def _extension(curve: Nurbs, end: int, beyond: Float64) -> tuple[Float64, Float6
     sign = 1.0 if end else -1.0
     inner = float(end) + sign * np.minimum(beyond, 0.0)
     outer = np.maximum(beyond, 0.0)[:, None]
-    points, first = values_at(curve, inner), values_at(curve, inner, 1)
-    bend = values_at(curve, float(end) - sign * np.linspace(0, 0.04, 5), 2).mean(axis=0)
-    tip = values_at(curve, np.array([float(end)]), 1)
+    points, first, _ = derivatives_at(curve, inner)
+    _, slope, second = derivatives_at(curve, float(end) - sign * np.linspace(0, 0.04, 5))
+    tip, bend = slope[0], second.mean(axis=0)
     points = points + outer * sign * tip + outer**2 / 2 * bend
     first = np.where(outer > 0, tip + sign * outer * bend, first)
     return points, first

@@ -32,7 +32,7 @@ def energies(
 def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[float, float]:
     """Median response along a curve that lies on the thread, left and right."""
     samples = Samples.of(curve.knots, 5)
-    both = views(rig, samples.values(curve.control_points), samples.values(curve.control_points, 1))
+    both = samples.views(rig, curve.control_points)
     left, right = (
         float(np.median(_response(image, view)))
         for image, view in zip((field.left, field.right), both, strict=True)
@@ -42,7 +42,7 @@ def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[flo
 
 def _end(curve: Nurbs, field: RidgeField, rig: StereoRig, cutoffs: tuple[float, float]) -> float:
     ends = Samples.at(curve.knots, np.array([0.0, 1.0]))
-    both = views(rig, ends.values(curve.control_points), ends.values(curve.control_points, 1))
+    both = ends.views(rig, curve.control_points)
     return sum(
         float(np.sum((_response(image, view) - cutoff) ** 2))
         for image, view, cutoff in zip((field.left, field.right), both, cutoffs, strict=True)

@@ -7,13 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.tracking.sampling import Samples, View, values_at, views
+from suturetrack.kernels.search import Int64
+from suturetrack.tracking.sampling import Samples, View, views_at
 from suturetrack.types import Bool, Float64, Nurbs
 
 # A curve lies on a part of itself that is so near and so parallel, and so far away along it; so many
 # samples in a row may lie elsewhere. What comes back at once has folded.
 _ON_PX, _PARALLEL, _TURN_PX, _STRAY = 2.0, 0.9, 25.0, 2
 _FOLD_PX = 40.0
+# Samples at both ends of which one does so.
+_TIPS = np.r_[: _STRAY + 1, -_STRAY - 1 : 0]
 # What is shorter than this may be noise.
 _SHORTEST_PX = 8.0
 # A tip that has just begun to fold runs back over so many of its pixels, at this cosine to its way there.
@@ -36,7 +39,7 @@ def doubled_ends(curve: Nurbs, rig: StereoRig) -> tuple[Tail, Tail]:
     Strands that cross are not parallel, and strands side by side are further apart.
     """
     samples = Samples.of(curve.knots, 4)
-    both = views(rig, samples.values(curve.control_points), samples.values(curve.control_points, 1))
+    both = samples.views(rig, curve.control_points)
     along = np.cumsum(samples.share * both[0].speed)
     inward = np.arange(0.0, min(_FOLD_PX, along[-1] / 2))
     start = _fold(curve, rig, 0, np.interp(inward, along, samples.s))
@@ -50,8 +53,8 @@ def _fold(curve: Nurbs, rig: StereoRig, end: int, inward: Float64) -> float:
 
     `inward` are parameters a pixel apart that begin at that end.
     """
-    both = views(rig, values_at(curve, inward), values_at(curve, inward, 1))
-    near, cosines = _compared(both, slice(_TIP))
+    both = views_at(rig, curve, inward)
+    near, cosines = _compared(both, np.arange(_TIP))
     tip, there = np.nonzero(near & (cosines.max(axis=0) < _OPPOSED))
     if not len(tip):
         return 0.0
@@ -61,17 +64,16 @@ def _fold(curve: Nurbs, rig: StereoRig, end: int, inward: Float64) -> float:
 def _long_tails(samples: Samples, both: tuple[View, View], along: Float64) -> tuple[Tail, Tail]:
     """The ends that lie on the curve further on, `along` px from its start."""
 
-    def back_at(rows: slice) -> Float64:
+    def back_at(rows: Int64) -> Float64:
         """(r,) px along the curve from samples to the nearest one that they lie on; inf for none."""
         gap = np.abs(along - along[rows, None])
         near, cosines = _compared(both, rows)
         parallel = np.abs(cosines).min(axis=0) > _PARALLEL
         return np.where(near & parallel & (gap >= _TURN_PX), gap, np.inf).min(axis=1)
 
-    tips = slice(None, _STRAY + 1), slice(-_STRAY - 1, None)
-    if not any(np.isfinite(back_at(rows)).any() for rows in tips):
+    if not np.isfinite(back_at(_TIPS)).any():
         return Tail(0.0, False), Tail(0.0, False)
-    back = back_at(slice(None))
+    back = back_at(np.arange(len(along)))
     start, is_fold = _doubled(back, along)
     stop, is_folded_stop = _doubled(back[::-1], along[-1] - along[::-1])
     s = samples.s
@@ -81,7 +83,7 @@ def _long_tails(samples: Samples, both: tuple[View, View], along: Float64) -> tu
     )
 
 
-def _compared(both: tuple[View, View], rows: slice) -> tuple[Bool, Float64]:
+def _compared(both: tuple[View, View], rows: Int64) -> tuple[Bool, Float64]:
     """(r, k) whether the samples `rows` lie on others in both images, and (2, r, k) cosines to them."""
     pixels = np.stack([view.pixels for view in both])
     tangents = np.stack([view.tangents for view in both])

@@ -30,7 +30,7 @@ from suturetrack.tracking.reliability import (
     judge,
     loose_ends,
 )
-from suturetrack.tracking.sampling import length_of, values_at, views
+from suturetrack.tracking.sampling import length_of, values_at, views_at
 from suturetrack.tracking.spacing import respace
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
 from suturetrack.types import Bool, Nurbs, RidgeField, Status, ThreadState
@@ -122,7 +122,7 @@ class Follower:
         model = self.model
         curve = model.motion.predict(model.curve, (capture_ns - model.capture_ns) * _NS)
         s = np.linspace(0, 1, _CLAIMS)
-        both = views(self.rig, values_at(curve, s), values_at(curve, s, 1))
+        both = views_at(self.rig, curve, s)
         seen = np.interp(s, np.linspace(0, 1, len(self._seen)), self._seen) > 0.5
         return Strand.other(both[0], seen), Strand.other(both[1], seen)
 

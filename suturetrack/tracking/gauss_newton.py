@@ -77,8 +77,7 @@ class Fit:
 
     def views(self, rig: StereoRig) -> tuple[View, View]:
         """The samples on the fitted curve, in both images."""
-        points = self.curve.control_points
-        return views(rig, self.samples.values(points), self.samples.values(points, 1))
+        return self.samples.views(rig, self.curve.control_points)
 
 
 def search_normals(
@@ -171,8 +170,8 @@ def _crowd(
     levels: tuple[float, float],
     neighbours: Neighbours,
 ) -> Bool:
-    points, first = samples.values(curve.control_points), samples.values(curve.control_points, 1)
-    return crowded(views(rig, points, first), samples.share, field, levels, neighbours)
+    both = samples.views(rig, curve.control_points)
+    return crowded(both, samples.share, field, levels, neighbours)
 
 
 def expected(
@@ -183,11 +182,11 @@ def expected(
     levels: tuple[float, float],
 ) -> tuple[Float64, Float64]:
     """(k,) the response of the thread left and right where it moves, which smears it."""
-    points, first = samples.values(after.control_points), samples.values(after.control_points, 1)
+    both = samples.views(rig, after.control_points)
     last = rig.project(samples.values(before.control_points))
     left, right = (
         level * np.maximum(1 / (1 + (_across(view, pixels) / _SMEARED_PX) ** 4), _LEAST_FADING)
-        for view, pixels, level in zip(views(rig, points, first), last, levels, strict=True)
+        for view, pixels, level in zip(both, last, levels, strict=True)
     )
     return left, right
 

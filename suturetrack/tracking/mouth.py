@@ -6,7 +6,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.tracking.ends import EndStep
-from suturetrack.tracking.sampling import length_of, values_at, views
+from suturetrack.tracking.sampling import derivatives_at, length_of, views
 from suturetrack.types import Float64, Nurbs
 
 # An end is at a mouth when it has stayed within this for so long while the thread became longer by so many
@@ -54,8 +54,8 @@ class Mouth:
         The `other` end must have moved meanwhile: where one of two lies still, that is the mouth.
         """
         length, at = length_of(curve), np.array([float(end)])
-        tip, outward = values_at(curve, at), (1 if end else -1) * values_at(curve, at, 1)
-        outward /= np.linalg.norm(outward)
+        tip, outward, _ = derivatives_at(curve, at)
+        outward *= (1 if end else -1) / np.linalg.norm(outward)
         if step is not None:
             self._pixel = step.pixel * length
             self._look(step, tip + step.offset * length * outward, length, other, rig, now_ns)

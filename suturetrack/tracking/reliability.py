@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import binary_opening
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.kernels.search import Int64
 from suturetrack.nurbs import part
 from suturetrack.tracking.gauss_newton import Fit
-from suturetrack.tracking.sampling import View, values_at, views
+from suturetrack.tracking.sampling import View, values_at, views_at
 from suturetrack.tracking.strands import SAME_STRAND_PX, Neighbours, Strand
 from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField, Status
 
@@ -186,17 +185,16 @@ class Doubt:
         self, before: Nurbs, predicted: Nurbs, after: Nurbs, seen: Bool, rig: StereoRig
     ) -> None:
         """One field later, in which the curve moved from `before` to `after`."""
-        s = _EVENLY
-        curves = before, predicted, after
-        places = [rig.project(values_at(curve, s))[0] for curve in curves]
-        both = views(rig, values_at(after, s), values_at(after, s, 1))
+        s, both = _EVENLY, views_at(rig, after, _EVENLY)
+        last, expected = (rig.project(values_at(curve, s))[0] for curve in (before, predicted))
+        places = both[0].pixels
         outside = ~np.all([view.inside(rig.image_size, _BORDER_PX) for view in both], axis=0)
-        moved, surprise = (_own_lengths(places[2] - place, seen) for place in places[:2])
+        moved, surprise = (_own_lengths(places - place, seen) for place in (last, expected))
         if seen.any():
             surprise = np.interp(s, s[seen], surprise[seen])
         drift = _DRIFT * moved + surprise + _DRIFT_AT_REST_PX
         comes_in = self.outside & ~outside
-        doubted = np.minimum(np.hypot(self.px, drift), _BULGE * _from_held(seen, places[2]))
+        doubted = np.minimum(np.hypot(self.px, drift), _BULGE * _from_held(seen, places))
         self.px = np.where(seen | comes_in, 0.0, doubted)
         self.outside = outside
 
@@ -234,7 +232,7 @@ def _own_lengths(steps: Float64, seen: Bool) -> Float64:
 def _from_held(seen: Bool, places: Float64) -> Float64:
     """(k,) way along (k, 2) places to the nearer of the long seen stretches around, px; infinite where
     there is none on one side."""
-    held = binary_opening(seen, np.ones(round(_HOLD * len(seen)), bool))
+    held = search.solid(seen, np.ones(len(seen)), round(_HOLD * len(seen)))
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
     before = np.maximum.accumulate(np.where(held, along, -np.inf))
     after = np.minimum.accumulate(np.where(held, along, np.inf)[::-1])[::-1]

@@ -39,6 +39,10 @@ class Samples:
         """(k, dim) points, or derivatives, for (n + 1, dim) control points."""
         return spline.combine(self.first, self.table[times], control_points)
 
+    def views(self, rig: StereoRig, control_points: Float64) -> tuple[View, View]:
+        """The samples in both images, for (n + 1, 3) control points."""
+        return views(rig, self.values(control_points), self.values(control_points, 1))
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -76,10 +80,20 @@ def views(rig: StereoRig, points: Float64, derivatives: Float64) -> tuple[View, 
     return left, right
 
 
-def values_at(curve: Nurbs, s: Float64, times: int = 0) -> Float64:
-    """(k, dim) points of a cubic curve, or derivatives, at parameters in [0, 1]."""
-    first, table = spline.local_basis(s, curve.knots)
-    return spline.combine(first, table[times], curve.control_points)
+def views_at(rig: StereoRig, curve: Nurbs, s: Float64) -> tuple[View, View]:
+    """A cubic curve in both images at parameters in [0, 1]."""
+    points, first, _ = derivatives_at(curve, s)
+    return views(rig, points, first)
+
+
+def values_at(curve: Nurbs, s: Float64) -> Float64:
+    """(k, dim) points of a cubic curve at parameters in [0, 1]."""
+    return derivatives_at(curve, s)[0]
+
+
+def derivatives_at(curve: Nurbs, s: Float64) -> Float64:
+    """(3, k, dim) the points, and the first and second derivatives, at parameters in [0, 1]."""
+    return spline.evaluate(s, curve.knots, curve.control_points)
 
 
 def length_of(curve: Nurbs) -> float:

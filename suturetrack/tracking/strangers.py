@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.metrics import polyline_length
-from suturetrack.tracking.sampling import View, values_at, views
+from suturetrack.tracking.sampling import View, views_at
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField
 
@@ -77,7 +77,7 @@ class Strangers:
             return self
         past = tuple(then for then in self._past if 0 <= now - then[0] < _REMEMBERED_NS)
         s = np.linspace(0, 1, _PLACES)
-        both = views(rig, values_at(curve, s), values_at(curve, s, 1))
+        both = views_at(rig, curve, s)
         shown = np.interp(s, np.linspace(0, 1, len(seen)), seen) > 0.5
         branches: list[Bool] = []
         ridges = []
@@ -133,8 +133,10 @@ def _branches(
         own_px: what is nearer to the curve is its own ridge.
     """
     away = _distances(power.shape, view.pixels, others)
-    ridge = ((power > _RIDGE**2) & (away > own_px)).astype(np.uint8)
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(ridge)
+    ridge = (power > _RIDGE**2) & (away > own_px)
+    if not (ridge & (stayed == 0)).any():
+        return np.zeros(len(view.pixels), bool)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(ridge.astype(np.uint8))
     shape = 2, len(view.pixels)
     touched, moved = np.zeros(shape, bool), np.zeros(shape, bool)
     for label in range(1, count):
