@@ -137,7 +137,10 @@ def common_name(rig: str, role: str) -> str:
 def _rules(name: str, rig: str, role: Role, *, said: Flow, heard: Flow) -> list[Rule]:
     """What a role says and what it hears, as flows of the one who applies the rules."""
     wiring: list[Topic[Any] | Question[Any, Any]]
-    own = [f"health/{p}" for p in role.processes] + _keys(role.publishes)
+    published = _keys(role.publishes)
+    own = [f"health/{p}" for p in role.processes] + published
+    # Who reads the health of one reads that of all, and says so.
+    read_by_others = _keys([topics.HEALTH] if role.processes else []) + published
     read = _keys((*role.reads, *role.keeps))
     served = _keys([*role.answers, *role.keeps])
     wiring = [*role.asks, *role.recalls]
@@ -146,7 +149,7 @@ def _rules(name: str, rig: str, role: Role, *, said: Flow, heard: Flow) -> list[
     everyone = [topics.alive("*")]
     parts: list[tuple[str, Flow, list[str], list[str]]] = [
         ("says", said, ["put", "delete"], own),
-        ("hears-who-reads", heard, ["declare_subscriber"], own),
+        ("hears-who-reads", heard, ["declare_subscriber"], read_by_others),
         ("reads", said, ["declare_subscriber"], read),
         ("hears", heard, ["put", "delete"], read),
         ("serves", said, ["declare_queryable", "reply"], served),

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from services import access, keys, topics
 from services.access import ROLES
 from services.client import Client, connect
 from services.keys import Authority, KeysConfig
+from services.status import RigWatch
 from services.topics import QUESTIONS, TOPICS, Question, Topic
 from suturetrack.stage import open_scene
 from suturetrack.types import InputError
@@ -218,7 +220,8 @@ def test_an_unknown_name_of_the_same_authority_hears_nothing(tmp_path: Path) -> 
 
 
 def test_a_rig_runs_behind_the_router(tmp_path: Path) -> None:
-    """Processes of every role over mutual TLS: a seed is accepted, a state and a grasp come back."""
+    """Processes of every role over mutual TLS: a seed is accepted, a state and a grasp come back, and each
+    process is seen at work."""
     domain = tmp_path / "keys"
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -244,6 +247,8 @@ def test_a_rig_runs_behind_the_router(tmp_path: Path) -> None:
             wait_until(lambda: viewer.latest() is not None, 20)
             with pytest.raises(InputError):
                 viewer.seed(pixel=(320, 240), timeout=1.0)
+        with closing(RigWatch("rig", domain / "rig-viewer.json5")) as watch:
+            wait_until(lambda: (watch.listen(), not watch.unheard)[1], 20)
     finally:
         for process in running:
             process.terminate()
