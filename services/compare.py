@@ -24,7 +24,7 @@ from suturetrack.types import Float64, InputError, Nurbs, Status
 
 _SAMPLES = 300
 _BARS = "▁▂▃▄▅▆▇█"
-_BINS = 30
+_BINS = 24
 
 
 @dataclass(frozen=True)
@@ -89,25 +89,31 @@ def compare(first: RunSummary, other: RunSummary, rig: StereoRig) -> list[Distan
 
 
 def show(summaries: list[RunSummary], distances: list[Distances], console: Console) -> None:
-    """Prints what the runs were like, a column a run, and their distances."""
+    """Prints which runs these are, what they were like, a column a run, and their distances."""
+    labels = [f"run {k}" for k in range(1, len(summaries) + 1)]
     names = [summary.name for summary in summaries]
+    label_of = dict(zip(names, labels, strict=True))
+    legend = new_table("Runs", "", "folder")
+    for label, name in zip(labels, names, strict=True):
+        legend.add_row(label, name)
+    console.print(legend)
     for thread in sorted({t.thread for summary in summaries for t in summary.threads}):
-        rows = new_table(f"Thread {thread}", "", *names)
+        rows = new_table(f"Thread {thread}", "", *labels)
         for label, value in _ROWS.items():
             rows.add_row(label, *(_of(summary, thread, value) for summary in summaries))
         console.print(rows)
-    rates = new_table("Processes: frames per second, latency p50 and p99 in ms", "process", *names)
+    rates = new_table("Processes: frames per second, latency p50 and p99 in ms", "process", *labels)
     for process in summaries[0].processes:
         rates.add_row(process.name, *(_rate(summary, process.name) for summary in summaries))
     console.print(rates)
     apart = new_table(
-        f"Distance from the curves of {names[0]} (mm)",
+        f"Distance from the curves of {labels[0]} (mm)",
         *("run", "thread", "frames", "equal", "p50", "p95", "largest", "at frame", "over time"),
     )
     for d in distances:
         spread, seen = Spread.of(d.mm), np.isfinite(d.mm).any()
         apart.add_row(
-            *(d.run, d.thread, str(len(d.frames)), str(d.equal)),
+            *(label_of[d.run], d.thread, str(len(d.frames)), str(d.equal)),
             *(number(x, 3) for x in (spread.p50, spread.p95, spread.largest)),
             str(d.frames[int(np.nanargmax(d.mm))]) if seen else "-",
             _bars(d.mm),

@@ -40,7 +40,7 @@ def test_equal_runs_pass_the_strictest_check(
 ) -> None:
     run(CompareConfig((runs[0], runs[0]), tolerance_mm=0.0, tolerance_tracking=0.0))
     distances = next(x for x in capsys.readouterr().out.splitlines() if " 0.000 " in x)
-    assert distances.split()[:4] == ["first", "0", "20", "20"]
+    assert distances.split()[:5] == ["run", "2", "0", "20", "20"]
 
 
 def test_a_moved_curve_is_measured_and_fails_its_tolerance(
