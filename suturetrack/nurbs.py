@@ -165,7 +165,9 @@ def with_ends(curve: Nurbs, start: float, stop: float) -> Nurbs:
     """
     c, t = _with_stop(curve.control_points, curve.knots, stop)
     c, t = _with_stop(c[::-1], 1 - t[::-1], 1 - start)
-    return curve_from(3, (1 - t[::-1] - start) / (stop - start), c[::-1])
+    knots = (1 - t[::-1] - start) / (stop - start)
+    knots[:4], knots[-4:] = 0.0, 1.0
+    return curve_from(3, knots, c[::-1])
 
 
 def _with_stop(c: Float64, t: Float64, stop: float) -> tuple[Float64, Float64]:

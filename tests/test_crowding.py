@@ -7,11 +7,13 @@ import pytest
 
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
+from suturetrack.segmentation import Segmenter
+from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker
 from suturetrack.tracking.crowding import covered, crowded
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
-from suturetrack.types import RidgeField, Seed, Status
+from suturetrack.types import RidgeField, Seed, Stamp, Status, StereoFrame
 from tests.painting import FPS, paint
 
 LEVELS = (0.8, 0.8)
@@ -30,7 +32,7 @@ def flags(
 ) -> np.ndarray:
     points = points[::4]
     both = views(rig, points, np.gradient(points, axis=0) * len(points))
-    return crowded(both, np.full(len(points), 1 / len(points)), field, LEVELS, others)
+    return crowded(both, np.full(len(points), 1 / len(points)), field, LEVELS, others).others
 
 
 def hook(radius: float, lift: float) -> np.ndarray:
@@ -117,6 +119,27 @@ def test_a_tip_beside_its_own_thread_crowds_it_and_a_loop_does_not(rig: StereoRi
     tip = np.flatnonzero((away > 4.5) & (np.arange(len(away)) > len(away) / 2))[-1]
     assert found[tip + 3 :].all()
     assert not found[:tip].any()
+
+
+def test_strands_that_make_one_ridge_do_not_bend_an_arm_that_shows_no_depth() -> None:
+    """The arms of this knot run along one another, and one of them goes on along an epipolar line."""
+    scene = open_scene("knot", 423, "endoscope")
+    mm, lengths, apart = 1000 * scene.rig.metres_per_unit, [], []
+    segmenter, tracker = Segmenter(scene.rig), Tracker(scene.rig)
+    for i in range(45):
+        frame = StereoFrame(Stamp(i, round(i * 1e9 / FPS), 0), *scene.render(i))
+        if i == 0:
+            seed = Seed("0", pixel=scene.seed_pixel(0))
+            segmenter.learn(frame, seed)
+            tracker.seed(seed)
+        state = tracker.step(segmenter.step(frame)).states[0]
+        truth = scene.truth(i)[0]
+        assert state.curve is not None
+        curve = nurbs.evaluate(state.curve, np.linspace(0, 1, 200))
+        apart.append(mm * np.linalg.norm(metrics.polyline_offsets(curve, truth.points), axis=1))
+        lengths.append(state.length / truth.length)
+    assert np.percentile(apart, 95) < 1.5
+    np.testing.assert_allclose(lengths, 1.0, atol=0.025)
 
 
 @pytest.mark.parametrize(("radius", "depth"), [(6.0, 4.0), (4.0, 6.0), (3.0, 4.0)])

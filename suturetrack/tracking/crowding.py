@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from suturetrack.kernels import search
@@ -17,17 +19,30 @@ _CLEAR = 0.4
 _SHORTEST_PX, _GAP_PX = 4.0, 48.0
 
 
+@dataclass(frozen=True, eq=False)
+class Crowd:
+    """Samples beside which another ridge runs, in either image."""
+
+    others: Bool
+    """(k,) beside another thread or an unknown ridge, or at an end beside the thread itself: whose the
+    ridge is, is doubtful."""
+    itself: Bool
+    """(k,) beside another strand of the thread: it is one ridge with it, and its middle is that of both."""
+
+    @property
+    def anyone(self) -> Bool:
+        """(k,) beside either."""
+        return self.others | self.itself
+
+
 def crowded(
     both: tuple[View, View],
     share: Float64,
     field: RidgeField,
     levels: tuple[float, float],
     neighbours: Neighbours,
-) -> Bool:
-    """(k,) samples beside which another thread or an unknown ridge runs, in either image.
-
-    The thread's own strands do not count, for in a knot they are all there is to go by; but those do
-    that run beside its ends.
+) -> Crowd:
+    """Looks beside the samples of a curve.
 
     Args:
         both: the samples as predicted, left and right.
@@ -36,10 +51,14 @@ def crowded(
         neighbours: other threads.
     """
     images = field.left, field.right
-    flags = np.zeros(len(share), bool)
+    flags, itself = np.zeros(len(share), bool), np.zeros(len(share), bool)
     for image, view, level, others in zip(images, both, levels, neighbours.both, strict=True):
-        flags |= _beside(image, view, share, level, others)
-    return _closed(flags, both[0].speed * share)
+        own = Strand.of(view, share)
+        touching = search.doubled(own.arrays, own.arrays, SAME_STRAND_PX, _NEAR_PX)
+        flags |= _beside(image, view, own, view.speed * share, level, others)
+        flags |= _from_the_ends(touching)
+        itself |= touching
+    return Crowd(_closed(flags, both[0].speed * share), itself)
 
 
 def covered(both: tuple[View, View], neighbours: Neighbours) -> Bool:
@@ -52,16 +71,17 @@ def covered(both: tuple[View, View], neighbours: Neighbours) -> Bool:
     return left | right
 
 
-def _beside(image: Float32, view: View, share: Float64, level: float, others: Strand) -> Bool:
-    own, lengths = Strand.of(view, share), view.speed * share
+def _beside(
+    image: Float32, view: View, own: Strand, lengths: Float64, level: float, others: Strand
+) -> Bool:
+    """(k,) samples, of so many px each, beside which another thread or an unknown ridge runs."""
     known = search.doubled(own.arrays, others.arrays, SAME_STRAND_PX, _NEAR_PX)
     itself = search.doubled(own.arrays, own.arrays, SAME_STRAND_PX, _GRID_PX[-1])
-    touching = search.doubled(own.arrays, own.arrays, SAME_STRAND_PX, _NEAR_PX)
     profiles = search.normal_profiles(image, view.pixels, view.tangents, _GRID_PX, 0.0)
     inner = profiles[:, 1:-1]
     summits = (inner > profiles[:, :-2]) & (inner >= profiles[:, 2:]) & (inner > _CLEAR * level)
     several = search.solid((summits.sum(axis=1) > 1) & ~itself, lengths, _SHORTEST_PX)
-    return known | several | _from_the_ends(touching)
+    return known | several
 
 
 def _from_the_ends(flags: Bool) -> Bool:

@@ -297,7 +297,7 @@ class Follower:
         if best.share > 0.3:
             known = covered(best.fit.views(self.rig), neighbours)
             cut = length_of(best.fit.curve) / length_of(model.curve) - 1.0
-            self._adjust_ends(field, best.fit.crowded, known, cut)
+            self._adjust_ends(field, best.fit.crowd.others, known, cut)
         self._cut_doubled_ends()
         model.curve, inserted, removed = rearrange(model.curve, self.rig)
         return best, inserted, removed

@@ -17,7 +17,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.kernels import rows, search, spline
 from suturetrack.nurbs import curve_from
 from suturetrack.tracking.config import TrackingConfig
-from suturetrack.tracking.crowding import crowded
+from suturetrack.tracking.crowding import Crowd, crowded
 from suturetrack.tracking.ends import end_shift
 from suturetrack.tracking.sampling import Samples, View, views
 from suturetrack.tracking.strands import NOBODY, SAME_STRAND_PX, Neighbours, Strand
@@ -72,8 +72,8 @@ class Fit:
     """(k, 2) px between the curve and what was found, left and right; nan where nothing was."""
     covariance: Float64
     """(k, 3, 3) of the samples' positions."""
-    crowded: Bool
-    """(k,) where another ridge runs close beside the thread."""
+    crowd: Crowd
+    """Where other ridges run close beside the thread."""
 
     def views(self, rig: StereoRig) -> tuple[View, View]:
         """The samples on the fitted curve, in both images."""
@@ -169,7 +169,7 @@ def _crowd(
     rig: StereoRig,
     levels: tuple[float, float],
     neighbours: Neighbours,
-) -> Bool:
+) -> Crowd:
     both = samples.views(rig, curve.control_points)
     return crowded(both, samples.share, field, levels, neighbours)
 
@@ -248,13 +248,13 @@ class _Linearized:
         levels: tuple[Float64, Float64],
         config: TrackingConfig,
         outlier_px: float,
-        crowd: Bool,
+        crowd: Crowd,
         surprise: Float64,
     ) -> _Equations:
         """The normal equations of the next step."""
         equations = _Equations(int(self.samples.first[-1]) + spline.ORDER)
         information, pull = self._past(reference, config, crowd, surprise)
-        worth = np.where(crowd, _CROWDED_WORTH, 1.0) / config.noise_px**2
+        worth = np.where(crowd.anyone, _CROWDED_WORTH, 1.0) / config.noise_px**2
         for view, amount, found, level in zip(
             self.views, self._amounts, self.offsets, levels, strict=True
         ):
@@ -268,7 +268,7 @@ class _Linearized:
         return equations
 
     def _past(
-        self, reference: _Reference, config: TrackingConfig, crowd: Bool, surprise: Float64
+        self, reference: _Reference, config: TrackingConfig, crowd: Crowd, surprise: Float64
     ) -> tuple[Float64, Float64]:
         """The prediction.
 
@@ -276,7 +276,8 @@ class _Linearized:
         where a view hides the thread, or it is not alone, it holds it in depth as well.
         """
         jacobians = self.views[0].jacobian, self.views[1].jacobian
-        firmness = self._half_hidden / _HIDDEN_DRIFT_PX**2 + _CROWDED_HOLD * crowd / surprise**2
+        firmness = self._half_hidden / _HIDDEN_DRIFT_PX**2
+        firmness += _CROWDED_HOLD * crowd.others / surprise**2
         drift = self._amounts[0] / config.drift_px**2 / 2
         held = firmness * self._amounts[0] * self._per_unit**2
         return rows.held_rows(jacobians, reference.points - self.points, drift, held)
@@ -300,10 +301,10 @@ class _Linearized:
         goal = kept[:, None] * reference.second - self.second
         return rows.shape_rows(self.first, goal, bending, stretch)
 
-    def surprise(self, crowd: Bool) -> Float64:
+    def surprise(self, crowd: Crowd) -> Float64:
         """(k,) px by which the thread has left the curve where it is alone, and so in between."""
-        left, right = (np.where(crowd, 0.0, np.abs(found.offset)) for found in self.offsets)
-        away, either, s = np.maximum(left, right), ~(crowd | self._hidden), self.samples.s
+        left, right = (np.where(crowd.others, 0.0, np.abs(found.offset)) for found in self.offsets)
+        away, either, s = np.maximum(left, right), ~(crowd.others | self._hidden), self.samples.s
         if not either.any():
             return np.ones(len(s))
         padded = np.pad(away[either], _SMOOTH // 2, mode="edge")

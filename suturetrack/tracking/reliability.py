@@ -92,7 +92,7 @@ class Evidence:
     @cached_property
     def alone(self) -> Bool:
         """(k,) whether no other ridge runs close beside the thread, at evenly spaced parameters."""
-        return ~self._even(self.fit.crowded)
+        return ~self._even(self.fit.crowd.others)
 
     @property
     def length_noise(self) -> float:
