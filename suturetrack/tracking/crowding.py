@@ -29,11 +29,6 @@ class Crowd:
     itself: Bool
     """(k,) beside another strand of the thread: it is one ridge with it, and its middle is that of both."""
 
-    @property
-    def anyone(self) -> Bool:
-        """(k,) beside either."""
-        return self.others | self.itself
-
 
 def crowded(
     both: tuple[View, View],

@@ -29,8 +29,9 @@ _CORRELATION_PX = 4.0
 _REFINED_PX = 3.0
 _OUTLIER_PX = 1.0
 _HIDDEN_DRIFT_PX = 3.0
-# What a measurement is worth where another ridge draws it aside, and what the prediction is, there
-# and in depth, against its errors around.
+# What a measurement is worth where another strand of the thread shares its ridge; and where another ridge
+# draws it aside, and what the prediction is, there and in depth, against its errors around.
+_SHARED_WORTH = 0.1
 _CROWDED_WORTH, _CROWDED_HOLD = 0.02, 0.3
 _LEAST_SURPRISE_PX, _SMOOTH = 0.3, 9
 # Share of its second derivatives that the curve is asked to keep where the prediction holds, and the
@@ -254,7 +255,8 @@ class _Linearized:
         """The normal equations of the next step."""
         equations = _Equations(int(self.samples.first[-1]) + spline.ORDER)
         information, pull = self._past(reference, config, crowd, surprise)
-        worth = np.where(crowd.anyone, _CROWDED_WORTH, 1.0) / config.noise_px**2
+        worth = np.where(crowd.itself, _SHARED_WORTH, 1.0) / config.noise_px**2
+        worth[crowd.others] *= _CROWDED_WORTH
         for view, amount, found, level in zip(
             self.views, self._amounts, self.offsets, levels, strict=True
         ):
