@@ -9,6 +9,7 @@ from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.ends import EndStep, EndWatch, end_shift, find_end
+from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.energies import measure_levels
 from suturetrack.tracking.folds import doubled_ends
 from suturetrack.types import Nurbs, Seed, Stamp, StereoFrame
@@ -145,6 +146,17 @@ def test_a_thread_of_unknown_length_is_soon_drawn_out_in_leaps(
         if watch.moves(step_at(0.0), step, 100.0, now)[1] > 2 * PIXEL:
             grown_s.append(now * 1e-9)
     assert grown_s[0] - hidden_s == pytest.approx(held_s, abs=0.1)
+
+
+def test_what_the_border_cuts_off_makes_the_rest_no_longer() -> None:
+    whole, _ = settled_watch(140.0)
+    cut, never_whole = EndWatch(110.0, 0), KnownLength(110.0)
+    cut.at_border = True
+    known = KnownLength(140.0).watched(whole).watched(cut)
+    assert known.is_exceeded(146.0, 0.5)
+    assert not known.is_exceeded(139.0, 0.5)
+    assert not known.is_outgrown(146.0, 0.5)
+    assert not never_whole.watched(cut).is_exceeded(146.0, 0.5)
 
 
 @pytest.mark.parametrize("ahead_px", [5.0, 10.0])

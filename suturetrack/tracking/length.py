@@ -31,6 +31,8 @@ class KnownLength:
     """Before an end of it was given up: that may have been hidden only."""
     is_established: bool = False
     """Whether it was steady for long enough, with both ends in the images, to be the thread's own."""
+    was_established: bool = False
+    """Whether it was so at any time: what the images' border cuts off since makes the rest no longer."""
     is_cut: bool = False
     """Whether a part was cut off the curve that has not been found again."""
 
@@ -50,8 +52,9 @@ class KnownLength:
 
     def watched(self, ends: EndWatch) -> KnownLength:
         """Established once the ends have settled; what the border cuts off comes in again."""
-        is_settled = self.is_established or ends.settled
-        return replace(self, is_established=is_settled and not ends.at_border)
+        is_established = (self.is_established or ends.settled) and not ends.at_border
+        was_established = self.was_established or is_established
+        return replace(self, is_established=is_established, was_established=was_established)
 
     def found(self, length: float, ends: EndWatch) -> KnownLength:
         """With a curve that may have what was cut off again."""
@@ -79,7 +82,7 @@ class KnownLength:
 
     def is_exceeded(self, length: float, noise: float) -> bool:
         """Whether a curve beside other ridges, which draw it aside, makes a detour."""
-        return self.is_established and length > (1 + _DETOUR) * self.now + noise
+        return self.was_established and length > (1 + _DETOUR) * self.now + noise
 
     def is_reached(self, length: float) -> bool:
         """Whether a curve lacks nothing of the thread's own length."""
