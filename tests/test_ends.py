@@ -9,9 +9,9 @@ from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.ends import EndStep, EndWatch, end_shift, find_end
-from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.energies import measure_levels
 from suturetrack.tracking.folds import doubled_ends
+from suturetrack.tracking.length import KnownLength
 from suturetrack.types import Nurbs, Seed, Stamp, StereoFrame
 from tests.painting import paint
 
