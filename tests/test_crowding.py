@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
-from suturetrack.tracking import Tracker
+from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.crowding import covered, crowded
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
@@ -119,6 +121,29 @@ def test_a_tip_beside_its_own_thread_crowds_it_and_a_loop_does_not(rig: StereoRi
     tip = np.flatnonzero((away > 4.5) & (np.arange(len(away)) > len(away) / 2))[-1]
     assert found[tip + 3 :].all()
     assert not found[:tip].any()
+
+
+def test_what_the_views_show_differently_beside_another_thread_tells_no_depth(
+    rig: StereoRig,
+) -> None:
+    thread = line((-15, -15), (15, 15))
+    moved = thread + [0.15, -0.15, 1.5]
+    knots = nurbs.clamped_knots(np.linspace(0, 1, 12)[1:-1], 3)
+    curve = nurbs.fit(thread, np.linspace(0, 1, len(thread)), knots, 3)
+    both = views(rig, thread, np.gradient(thread, axis=0))
+    beside = (replace(view, pixels=view.pixels + 3 * view.normals) for view in both)
+    left, right = (Strand.other(view, np.ones(len(thread), bool)) for view in beside)
+    shares = []
+    for others in (NOBODY, Neighbours(((left, right),))):
+        field = paint(rig, [moved], 0, noise=0.0)
+        fit = gauss_newton.fit(curve, curve, field, rig, LEVELS, 5.0, TrackingConfig(), others)
+        assert fit.crowd.others.all() == bool(others.threads)
+        step = nurbs.evaluate(fit.curve, np.array([0.5])) - nurbs.evaluate(curve, np.array([0.5]))
+        across = (step[0, :2] @ [1, -1]) / 0.3
+        shares.append((across, step[0, 2] / 1.5))
+    np.testing.assert_allclose(shares[0], 1.0, atol=0.1)
+    assert shares[1][0] > 0.7
+    assert shares[1][1] < 0.3
 
 
 def test_strands_that_make_one_ridge_do_not_bend_an_arm_that_shows_no_depth() -> None:

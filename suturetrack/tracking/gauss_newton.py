@@ -29,9 +29,8 @@ _CORRELATION_PX = 4.0
 _REFINED_PX = 3.0
 _OUTLIER_PX = 1.0
 _HIDDEN_DRIFT_PX = 3.0
-# What a measurement is worth where another strand of the thread shares its ridge; and where another ridge
-# draws it aside, and what the prediction is, there and in depth, against its errors around.
-_SHARED_WORTH = 0.1
+# What a measurement is worth where another ridge, or another strand of the thread, draws it aside; and what
+# the prediction is beside another ridge, in depth as well, against its errors around.
 _CROWDED_WORTH, _CROWDED_HOLD = 0.02, 0.3
 _LEAST_SURPRISE_PX, _SMOOTH = 0.3, 9
 # Share of its second derivatives that the curve is asked to keep where the prediction holds, and the
@@ -255,19 +254,35 @@ class _Linearized:
         """The normal equations of the next step."""
         equations = _Equations(int(self.samples.first[-1]) + spline.ORDER)
         information, pull = self._past(reference, config, crowd, surprise)
-        worth = np.where(crowd.itself, _SHARED_WORTH, 1.0) / config.noise_px**2
-        worth[crowd.others] *= _CROWDED_WORTH
-        for view, amount, found, level in zip(
-            self.views, self._amounts, self.offsets, levels, strict=True
-        ):
+        worth = np.where(crowd.others | crowd.itself, _CROWDED_WORTH, 1.0) / config.noise_px**2
+        weights = []
+        for amount, found, level in zip(self._amounts, self.offsets, levels, strict=True):
             weight = worth * amount * found.found * np.minimum(found.response / level, 1) ** 2
-            weight /= (1 + (found.offset / outlier_px) ** 2) ** 2
+            weights.append(weight / (1 + (found.offset / outlier_px) ** 2) ** 2)
+        together = crowd.others & ~self._half_hidden
+        for view, found, weight in zip(self.views, self.offsets, weights, strict=True):
+            alone = np.where(together, 0.0, weight)
             rows.add_measured_rows(
-                view.tangents, view.jacobian, weight, found.offset, information, pull
+                view.tangents, view.jacobian, alone, found.offset, information, pull
             )
+        self._add_middle(together, weights[0] + weights[1], information, pull)
         equations.add(self.samples, 0, information, pull)
         equations.add(self.samples, 2, *self._shape(reference, config, surprise))
         return equations
+
+    def _add_middle(
+        self, which: Bool, weight: Float64, information: Float64, pull: Float64
+    ) -> None:
+        """Rows for the middle of what both views show at `which` samples, of the weight of both.
+
+        What they show differently of ridges that blur into one another tells no depth.
+        """
+        both = [(view.normals[which, None] @ view.jacobian[which])[:, 0] for view in self.views]
+        row = both[0] + both[1]
+        offset = self.offsets[0].offset[which] + self.offsets[1].offset[which]
+        weighted = weight[which, None] / 4 * row
+        information[which] += weighted[:, :, None] * row[:, None, :]
+        pull[which] += weighted * offset[:, None]
 
     def _past(
         self, reference: _Reference, config: TrackingConfig, crowd: Crowd, surprise: Float64
