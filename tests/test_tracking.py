@@ -300,6 +300,35 @@ def test_a_hidden_end_is_held_and_taken_up_again(rig: StereoRig) -> None:
     assert max(error(states[-1], truths[-1]).ends) < 0.6
 
 
+def with_end_bent(points: np.ndarray, angle: float, more: int = 0) -> np.ndarray:
+    """A thread whose last eighth bends aside, still as long, or longer by `more` steps."""
+    steps = np.diff(points, axis=0)
+    steps = np.r_[steps, np.repeat(steps[-1:], more, axis=0)]
+    turns = angle * np.clip((np.arange(len(steps)) - 520) / 80, 0.0, 1.0)
+    cos, sin = np.cos(turns), np.sin(turns)
+    x, y, z = steps.T
+    bent = np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
+    return points[0] + np.r_[np.zeros((1, 3)), np.cumsum(bent, axis=0)]
+
+
+def test_an_end_that_springs_aside_is_taken_up_where_it_is(rig: StereoRig) -> None:
+    truth = thread(0.0)
+    truths = [truth if i < 36 else with_end_bent(truth, 3.0) for i in range(40)]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    for state in follow(fields, rig, seed_on(rig, truth))[36:]:
+        assert state.status is Status.TRACKING
+        assert max(error(state, truths[-1]).ends) < 1.0
+
+
+def test_an_end_does_not_spring_aside_onto_what_makes_the_thread_longer(rig: StereoRig) -> None:
+    truth = thread(0.0)
+    truths = [truth if i < 36 else with_end_bent(truth, 3.0, more=40) for i in range(40)]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    for state in follow(fields, rig, seed_on(rig, truth))[36:39]:
+        assert state.length == pytest.approx(100.0, rel=0.02)
+        assert not state.seen[-4:].any()
+
+
 def test_what_a_tool_has_swept_over_is_taken_up_as_a_whole(rig: StereoRig) -> None:
     truths = [thread(i / FPS) + np.array([0.1 * i, 0.0, 0.0]) for i in range(50)]
     fields, swept = [], range(10, 36)

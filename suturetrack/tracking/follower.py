@@ -21,6 +21,7 @@ from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.motion import Motion
 from suturetrack.tracking.mouth import Mouth
+from suturetrack.tracking.regrowth import regrown
 from suturetrack.tracking.reliability import (
     ASTRAY,
     RELIABILITY_SAMPLES,
@@ -45,6 +46,8 @@ _VAGUE = 0.0225
 # How long a doubtful end is held before it is cut off.
 _PATIENCE_S = 0.06
 _SOME = 0.2
+# Fields after which ends that are not seen are looked for elsewhere.
+_REGROWN = 3
 # For how long a hidden end is taken to be where it was, and after how long it is gone.
 _HIDDEN_S, _GONE_S = 0.3, 2.0
 # What has to be seen of the last good curve beyond what is seen of the rest, against the length.
@@ -145,6 +148,8 @@ class Follower:
         self._doubt.grow(before, predicted, model.curve, evidence.evenly_seen, self.rig)
         for further, more, fewer in self._follow_into_sight(field, neighbours):
             evidence, inserted, removed = further, inserted + more, removed + fewer
+        if self.config.method != "paper":
+            evidence = self._grow_ends_anew(field, evidence, neighbours)
         self._seen = evidence.evenly_seen
         if evidence.share >= 0.5:
             model.seen_ns = model.capture_ns
@@ -325,6 +330,29 @@ class Follower:
             step = self._follow_by_least_squares(field, before, neighbours)
             self._doubt.grow(before, before, model.curve, step[0].evenly_seen, self.rig)
             yield step
+
+    def _grow_ends_anew(
+        self, field: RidgeField, evidence: Evidence, neighbours: Neighbours
+    ) -> Evidence:
+        """Now and then, the ends that are not seen, where the thread plainly ends elsewhere."""
+        model, known = self.model, self.known_length
+        if field.stamp.frame % _REGROWN or not known.is_established:
+            return evidence
+        others = neighbours.shown_in(field, model.levels)
+
+        def fitted(curve: Nurbs) -> Evidence:
+            reach_px, levels = self.config.search_px, model.levels
+            return Evidence.of(
+                gauss_newton.fit(
+                    curve, curve, field, self.rig, levels, reach_px, self.config, others
+                )
+            )
+
+        found = regrown(model.curve, evidence, known, field, self.rig, model.levels, fitted)
+        if found is None:
+            return evidence
+        model.curve = found.fit.curve
+        return found
 
     def _cut_doubled_ends(self) -> None:
         """Cuts off what has folded; a tip may lie on its own thread, where the curve is not too long."""

@@ -88,6 +88,10 @@ class KnownLength:
         """Whether a curve lacks nothing of the thread's own length."""
         return self.is_established and length >= self.now
 
+    def is_met(self, length: float, noise: float) -> bool:
+        """Whether a curve has the thread's length, to what noise and a bend leave open."""
+        return abs(length - self.now) <= _CROWDED_TOLERANCE * self.now + noise
+
     def is_short(self, length: float) -> bool:
         """Whether a curve lacks what was cut off."""
         return self.is_cut and length < (1 - _TOLERANCE) * self.now

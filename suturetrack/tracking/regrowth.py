@@ -1,0 +1,87 @@
+"""Ends that are not seen where they should be, grown anew along the ridge from where the thread is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from suturetrack import nurbs
+from suturetrack.camera import StereoRig
+from suturetrack.tracking.control_points import rearrange
+from suturetrack.tracking.ends import find_end, with_ends
+from suturetrack.tracking.length import KnownLength
+from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Evidence, loose_ends
+from suturetrack.tracking.sampling import length_of
+from suturetrack.types import Nurbs, RidgeField
+
+# Samples that have to be unseen at an end, and that may be at most. One beside them may have left the
+# thread as well.
+_FEW, _MANY, _BESIDE = 2, 20, 1
+# How often an end is drawn out, at most, and by how much at least to be drawn out once more.
+_STEPS, _LEAST_PX = 8, 2.0
+
+
+def regrown(
+    curve: Nurbs,
+    evidence: Evidence,
+    known: KnownLength,
+    field: RidgeField,
+    rig: StereoRig,
+    levels: tuple[float, float],
+    fitted: Callable[[Nurbs], Evidence],
+) -> Evidence | None:
+    """The curve with an end elsewhere; None where what is not seen of its ends may be hidden.
+
+    An end that is let go springs aside, and what is left of the curve there points nowhere. It is not
+    hidden if the thread plainly goes on from where it is seen, with nothing beside it, and is as long
+    as ever that way.
+
+    Args:
+        curve: as its ends are now.
+        evidence: what the field says about it.
+        known: what is known of the thread's length.
+        field: what shows the thread.
+        rig: the cameras.
+        levels: response of a clear view of the thread, left and right.
+        fitted: lays a curve on the field.
+    """
+    found = None
+    for end, unseen in enumerate(loose_ends(~evidence.evenly_seen)):
+        if not _FEW <= unseen <= _MANY:
+            continue
+        other = _grown(_without(curve, end, unseen + _BESIDE), end, field, rig, levels, fitted)
+        if other is not None and _is_plain(other, end, unseen, known):
+            found, curve = other, other.fit.curve
+    return found
+
+
+def _without(curve: Nurbs, end: int, samples: int) -> Nurbs:
+    part = samples / (RELIABILITY_SAMPLES - 1)
+    return nurbs.part(curve, 0.0, 1.0 - part) if end else nurbs.part(curve, part, 1.0)
+
+
+def _grown(
+    curve: Nurbs,
+    end: int,
+    field: RidgeField,
+    rig: StereoRig,
+    levels: tuple[float, float],
+    fitted: Callable[[Nurbs], Evidence],
+) -> Evidence | None:
+    """The curve drawn out along the ridge at an end, None if there is none."""
+    evidence = None
+    for _ in range(_STEPS):
+        step = find_end(curve, end, field, rig, levels)
+        if step is None or step.offset_px < _LEAST_PX:
+            break
+        start, stop = (0.0, step.offset) if end else (step.offset, 0.0)
+        curve, _, _ = rearrange(with_ends(curve, -start, 1.0 + stop), rig)
+        evidence = fitted(curve)
+        curve = evidence.fit.curve
+    return evidence
+
+
+def _is_plain(evidence: Evidence, end: int, samples: int, known: KnownLength) -> bool:
+    """Whether so many samples of the new end are seen and alone, and the thread has its length."""
+    tail = slice(-samples, None) if end else slice(samples)
+    is_seen = bool((evidence.evenly_seen & evidence.alone)[tail].all())
+    return is_seen and known.is_met(length_of(evidence.fit.curve), evidence.length_noise)
