@@ -461,22 +461,24 @@ def test_places_that_are_clear_in_one_look_each_are_sure_together(
     assert not sureness.is_sure
 
 
-@pytest.mark.parametrize("as_long", [True, False])
-def test_doubts_about_a_curve_are_not_settled_by_looks_at_a_longer_one(
-    rig: StereoRig, as_long: bool
+@pytest.mark.parametrize(
+    ("as_long", "likely", "is_sure"), [(True, 0.4, True), (False, 0.4, False), (True, 0.3, False)]
+)
+def test_looks_settle_doubts_about_a_curve_of_one_length_that_one_finds_likely(
+    rig: StereoRig, as_long: bool, likely: float, is_sure: bool
 ) -> None:
     """An end beside another ridge, as one look sees it, is a crossing once the curve runs on there."""
     part = 1.0 if as_long else 0.9
     sureness: Sureness | None = None
-    for turn, (left, length) in enumerate([(((0.4, 0.3),), part), (((0.9, 0.3),), 1.0)]):
-        found = look_at(rig, thread(0.6 * turn), 0.3)
+    for turn, (left, length) in enumerate([(((0.4, likely),), part), (((0.9, likely),), 1.0)]):
+        found = look_at(rig, thread(0.6 * turn), likely)
         curve = nurbs.part(found.curve, 0.0, length)
         found = replace(found, curve=curve, doubts=(left, ()))
         sureness = sureness or Sureness(found, curve, 0, rig)
         assert not sureness.is_sure
         sureness.weigh(found, curve)
     assert sureness is not None
-    assert sureness.is_sure == as_long
+    assert sureness.is_sure == is_sure
 
 
 @pytest.mark.parametrize("stays", [True, False])

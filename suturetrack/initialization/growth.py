@@ -87,14 +87,18 @@ class Thread:
 
 
 def follow_thread(
-    ridges: Ridges, origin: int, config: InitializationConfig, depth: Depth | None = None
+    ridges: Ridges,
+    origin: int,
+    seed: Float64,
+    config: InitializationConfig,
+    depth: Depth | None = None,
 ) -> Thread:
-    """The merged segments through segment `origin`."""
+    """The merged segments through segment `origin`, the one that the seed (2,) means."""
     merged = merge_ends(ridges, config, depth)
     ridges = replace(ridges, segments=merged.segments)
     entries = _without_faint_ends(ridges, follow(origin, merged.partner), origin)
     pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
-    chain = replace(_join(pieces), doubts=tuple(doubts(merged, entries, ridges)))
+    chain = replace(_join(pieces), doubts=tuple(doubts(merged, entries, ridges, seed)))
     return Thread(ridges, entries, origin, chain)
 
 

@@ -15,6 +15,8 @@ SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
 # Votes for a curve without doubts that make it sure, in those of a look that is just sure by itself.
 _ENOUGH = 1.5
+# What the likeliest of the looks has to be for that.
+_LIKELY = 0.35
 # And those that the look by which another curve was voted down has to have more.
 _PLENTY = 3.0
 # Confidence of the first look that needs no second one.
@@ -129,8 +131,10 @@ class Sureness:
             self._doubts, self.confidence = None, confidence
             self._settle(found)
         elif agrees:
+            self.confidence = max(self.confidence, confidence)
             left = self._settle(found)
-            self.is_sure = max(self._evidence, self._votes >= _ENOUGH) * left >= _TOGETHER
+            together = max(self._evidence, self._votes >= _ENOUGH) * left
+            self.is_sure = together >= _TOGETHER and self.confidence >= _LIKELY
         return is_outvoted
 
     def outweighs(self, confidence: float, found: Nurbs, followed: Nurbs, *, likely: float) -> bool:
