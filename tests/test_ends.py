@@ -204,6 +204,14 @@ def test_an_end_that_went_on_is_drawn_in_again() -> None:
         assert length * (1.0 + stop) == pytest.approx(100.0)
 
 
+def test_a_thread_slides_along_itself_while_a_loop_of_it_is_drawn_shut() -> None:
+    """What one end loses the other gains: nothing is hidden, though the curve became shorter meanwhile."""
+    watch, now = settled_watch(100.0)
+    start, stop = watch.moves(step_at(-10.0), step_at(10.0), 96.0, now + FRAME_NS)
+    assert (start, stop) == pytest.approx((-10.0 * PIXEL, 10.0 * PIXEL))
+    assert watch.seen == (True, True)
+
+
 def test_an_end_that_steps_off_is_held_where_it_was() -> None:
     watch, now = settled_watch(100.0)
     start, stop = watch.moves(step_at(0.0), step_at(-30.0), 100.0, now + FRAME_NS)

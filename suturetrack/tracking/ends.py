@@ -268,6 +268,8 @@ class EndWatch:
                 end
                 for end, step in enumerate(shown)
                 if step.offset_px < -_CUT_PX and offsets[end] <= min(offsets) / 2
+                # What the other end gains is not hidden.
+                and sum(offsets) <= offsets[end] / 2
             ]
         return [end for end in doubted if unseen_s[end] < _HELD_S]
 
