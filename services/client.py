@@ -50,6 +50,9 @@ Area = tuple[float, float, float, float]
 _ARRIVAL_S = 3.0
 """How long whoever answers may take to appear."""
 _ANSWER_S = 2.0
+_GONE_NS = 3_000_000_000
+"""A thread of which nothing has come for so long, while something came of others, is followed no more: the
+tracker that held it has ended, and another one runs."""
 
 log = logging.getLogger("suturetrack")
 
@@ -127,7 +130,7 @@ class Client:
 
     @property
     def threads(self) -> tuple[str, ...]:
-        """Names of the threads of which a state has arrived."""
+        """Names of the threads of which states arrive, or did when states last arrived of any."""
         with self._lock:
             return tuple(self._latest)
 
@@ -335,6 +338,11 @@ class Client:
                 self._latest[state.thread] = seen
                 if FORGOTTEN in state.events:
                     del self._latest[state.thread]
+                self._latest = {
+                    name: other
+                    for name, other in self._latest.items()
+                    if seen.arrived_ns - other.arrived_ns < _GONE_NS
+                }
                 for inbox, thread in self._listeners.items():
                     if thread in (None, state.thread):
                         inbox.put(seen)

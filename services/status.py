@@ -14,11 +14,11 @@ from rich.text import Text
 
 from services import topics
 from services.bus import Bus
-from services.freshness import Freshness
+from services.client import Client, Seen
 from services.messages import Health
 from services.tables import new_table, number
 from services.zenoh_transport import ZenohTransport, load_config, local_config, local_rigs
-from suturetrack.types import InputError, Status, ThreadState
+from suturetrack.types import InputError, Status
 
 _LOOK_S = 0.25
 _FIRST_S = 1.5
@@ -46,10 +46,8 @@ class RigWatch:
         self.rig = rig
         self.health: dict[str, tuple[Health, int]] = {}
         """By process: its last heartbeat, and when it arrived by the wall clock, ns."""
-        self.threads: dict[str, tuple[ThreadState, int]] = {}
-        """By thread: its last state, and when it arrived by the monotonic clock, ns."""
         self.bus = Bus(ZenohTransport(config), rig, "status")
-        self._states = self.bus.every(topics.STATE)
+        self._client = Client(self.bus)
         self._healths = self.bus.every(topics.HEALTH)
 
     def listen(self) -> None:
@@ -57,8 +55,12 @@ class RigWatch:
         while (health := self._healths.get(0)) is not None:
             late_ns = time.monotonic_ns() - self._healths.arrived_ns
             self.health[health.process] = health, time.time_ns() - late_ns
-        while (state := self._states.get(0)) is not None:
-            self.threads[state.thread] = state, self._states.arrived_ns
+
+    @property
+    def threads(self) -> dict[str, Seen]:
+        """By thread: its last state."""
+        latest = {name: self._client.latest(name) for name in self._client.threads}
+        return {name: seen for name, seen in latest.items() if seen is not None}
 
     @property
     def unheard(self) -> list[str]:
@@ -96,13 +98,12 @@ class RigWatch:
 
     def _threads(self) -> Table:
         table = new_table("Threads", "thread", "status", "live", "length mm", "seen %", "frame")
-        for name, (state, arrived_ns) in sorted(self.threads.items()):
-            fresh = Freshness.of(state.stamp, arrived_ns)
-            good = state.status is Status.TRACKING
+        for name, seen in sorted(self.threads.items()):
+            state, good = seen.state, seen.state.status is Status.TRACKING
             table.add_row(
                 name,
                 Text(str(state.status), style="green" if good else "red"),
-                Text("yes") if fresh.live else Text(fresh.reason, style="red"),
+                Text("yes") if seen.live else Text(seen.reason, style="red"),
                 number(1000 * state.length, 1),
                 number(100 * float(state.seen.mean()) if len(state.seen) else 0.0, 0),
                 str(state.stamp.frame),

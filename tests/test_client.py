@@ -292,6 +292,20 @@ def test_a_forgotten_thread_is_gone_after_its_last_state(stage: Stage) -> None:
     wait_until(lambda: [frame for _, frame, _ in got][:2] == [1, 2])
 
 
+def test_a_thread_that_nobody_follows_any_more_is_gone(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another tracker runs since, and tells of its own threads alone."""
+    monkeypatch.setattr("services.client._GONE_NS", 50_000_000)
+    stage.publish(1, "a")
+    wait_until(lambda: stage.client.threads == ("a",))
+    wait_until(lambda: (seen := stage.client.latest("a")) is not None and not seen.live)
+    assert stage.client.threads == ("a",)
+    stage.publish(2, "b")
+    wait_until(lambda: stage.client.threads == ("b",))
+    assert stage.client.latest("a") is None
+
+
 def test_nobody_there_is_said_plainly(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.client._ARRIVAL_S", 0.05)
     with pytest.raises(Unavailable, match="no tracker runs on rig 'rig'"):

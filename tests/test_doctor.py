@@ -153,7 +153,7 @@ def test_status_shows_processes_and_threads(rig: Bus, capsys: pytest.CaptureFixt
         watch.listen()
     watch.close()
     assert watch.health["source"][0].warning == "cable loose"
-    assert watch.threads["a"][0].status is Status.LOST
+    assert watch.threads["a"].state.status is Status.LOST
     assert watch.unheard == ["segmenter", "tracker"]
     assert [table.row_count for table in watch.tables()] == [3, 1]
     assert rig.rig in local_rigs()

@@ -267,7 +267,8 @@ class EndWatch:
             doubted = [
                 end
                 for end, step in enumerate(shown)
-                if step.offset_px < -_CUT_PX and offsets[end] <= min(offsets) / 2
+                if step.offset_px < -_CUT_PX
+                and offsets[end] <= min(offsets) / 2
                 # What the other end gains is not hidden.
                 and sum(offsets) <= offsets[end] / 2
             ]
