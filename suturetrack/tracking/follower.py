@@ -21,7 +21,7 @@ from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.motion import Motion
 from suturetrack.tracking.mouth import Mouth
-from suturetrack.tracking.regrowth import regrown
+from suturetrack.tracking.regrowth import regrown, unseen_tails
 from suturetrack.tracking.reliability import (
     ASTRAY,
     RELIABILITY_SAMPLES,
@@ -46,8 +46,8 @@ _VAGUE = 0.0225
 # How long a doubtful end is held before it is cut off.
 _PATIENCE_S = 0.06
 _SOME = 0.2
-# Fields after which ends that are not seen are looked for elsewhere.
-_REGROWN = 3
+# How often ends that are not seen are looked for elsewhere.
+_REGROWN_S = 0.09
 # For how long a hidden end is taken to be where it was, and after how long it is gone.
 _HIDDEN_S, _GONE_S = 0.3, 2.0
 # What has to be seen of the last good curve beyond what is seen of the rest, against the length.
@@ -85,7 +85,7 @@ class Follower:
         self.known_length = KnownLength(length_of(curve))
         self._lost = False
         self._certain_ns = now
-        self._doubted_ns = -(1 << 62)
+        self._doubted_ns = self._regrown_ns = -(1 << 62)
         self._doubt = Doubt()
         self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
@@ -334,10 +334,12 @@ class Follower:
     def _grow_ends_anew(
         self, field: RidgeField, evidence: Evidence, neighbours: Neighbours
     ) -> Evidence:
-        """Now and then, the ends that are not seen, where the thread plainly ends elsewhere."""
-        model, known = self.model, self.known_length
-        if field.stamp.frame % _REGROWN or not known.is_established:
+        """Every now and then, the ends that are not seen, where the thread plainly ends elsewhere."""
+        model, known, tails = self.model, self.known_length, unseen_tails(evidence)
+        rested_s = (model.capture_ns - self._regrown_ns) * _NS
+        if not (tails and known.is_established) or 0 <= rested_s < _REGROWN_S:
             return evidence
+        self._regrown_ns = model.capture_ns
         others = neighbours.shown_in(field, model.levels)
 
         def fitted(curve: Nurbs) -> Evidence:
@@ -348,7 +350,7 @@ class Follower:
                 )
             )
 
-        found = regrown(model.curve, evidence, known, field, self.rig, model.levels, fitted)
+        found = regrown(model.curve, tails, known, field, self.rig, model.levels, fitted)
         if found is None:
             return evidence
         model.curve = found.fit.curve

@@ -20,9 +20,15 @@ _FEW, _MANY, _BESIDE = 2, 20, 1
 _STEPS, _LEAST_PX = 8, 2.0
 
 
+def unseen_tails(evidence: Evidence) -> dict[int, int]:
+    """By end, 0 or 1, how many of the evenly spaced samples there are not seen, where it is a few."""
+    counts = loose_ends(~evidence.evenly_seen)
+    return {end: count for end, count in enumerate(counts) if _FEW <= count <= _MANY}
+
+
 def regrown(
     curve: Nurbs,
-    evidence: Evidence,
+    tails: dict[int, int],
     known: KnownLength,
     field: RidgeField,
     rig: StereoRig,
@@ -37,7 +43,7 @@ def regrown(
 
     Args:
         curve: as its ends are now.
-        evidence: what the field says about it.
+        tails: of `unseen_tails`.
         known: what is known of the thread's length.
         field: what shows the thread.
         rig: the cameras.
@@ -45,9 +51,7 @@ def regrown(
         fitted: lays a curve on the field.
     """
     found = None
-    for end, unseen in enumerate(loose_ends(~evidence.evenly_seen)):
-        if not _FEW <= unseen <= _MANY:
-            continue
+    for end, unseen in tails.items():
         other = _grown(_without(curve, end, unseen + _BESIDE), end, field, rig, levels, fitted)
         if other is not None and _is_plain(other, end, unseen, known):
             found, curve = other, other.fit.curve
