@@ -202,19 +202,6 @@ def test_a_crossing_is_passed_straight_on(rig: StereoRig) -> None:
     assert abs(spearmanr(straight, np.arange(len(straight))).statistic) > 0.99
 
 
-@pytest.mark.parametrize(("place", "is_doubtful"), [(1500, True), (1000, False)])
-def test_a_seed_where_two_threads_cross_may_mean_either(
-    rig: StereoRig, place: int, is_doubtful: bool
-) -> None:
-    across = np.linspace(-1.0, 1.0, 3000)[:, None]
-    threads = [across * [40, side * 8, 2] + [0, 0, 195] for side in (1, -1)]
-    views = [rig.project(points) for points in threads]
-    left, right = (draw(views[1][k], rig, draw(views[0][k], rig)) for k in (0, 1))
-    found = initialize(field_of(left, right, rig), rig, Seed(pixel=tuple(views[0][0][place])))
-    assert any("a seed where two strands meet" in r for r in found.reasons) == is_doubtful
-    assert (found.confidence < 0.5) == is_doubtful
-
-
 def loop_with_a_shared_run() -> Float64:
     """A thread that winds once and a quarter around a circle, the second time behind the first."""
     t = np.linspace(-0.35 * np.pi, 2.05 * np.pi, 2500)

@@ -111,7 +111,7 @@ def _initialize(
         reason = _nothing_there(scale * candidates, scale * pixel, config)
         raise InitializationError(reason, candidates)
     nearest = float(rig.left.projection[0, 2] - rig.right.projection[0, 2])
-    thread = follow_thread(left, origin, pixel, config)
+    thread = follow_thread(left, origin, config)
     rows = row_offset(thread.chain, field.left, field.right, nearest)
     found: Initialization | None = None
     try:

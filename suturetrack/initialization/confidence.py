@@ -8,15 +8,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization.doubts import (
-    CROSSING,
-    FADES,
-    FOREIGN,
-    HIDDEN,
-    SEEDED,
-    SHARED,
-    Doubt,
-)
+from suturetrack.initialization.doubts import CROSSING, FADES, FOREIGN, HIDDEN, SHARED, Doubt
 from suturetrack.initialization.growth import Chain
 from suturetrack.initialization.model import PlacedDoubts, remaining
 from suturetrack.initialization.samples import Samples
@@ -140,7 +132,7 @@ def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
     """
     kept = []
     for place, why, rest in doubts:
-        if why in (*FOREIGN, HIDDEN, SEEDED):
+        if why in (*FOREIGN, HIDDEN):
             kept.append((place, why, rest))
             continue
         near = np.flatnonzero(np.linalg.norm(line - place, axis=1) <= _SAME_PLACE_PX)
@@ -168,9 +160,7 @@ def _placed(
         at = int(np.argmin(np.linalg.norm(line - place, axis=1)))
         there = counterpart[at]
         both = max(rest, min(_same(why, there, doubts[1 - view]), default=1.0))
-        if why in (SHARED, SEEDED) or not _is_shared(
-            place, line, counterpart, chains[1 - view].pixels
-        ):
+        if why == SHARED or not _is_shared(place, line, counterpart, chains[1 - view].pixels):
             left = rest
         elif why in (CROSSING, FADES, *FOREIGN) and both < _GRAVE:
             left = both
@@ -264,7 +254,7 @@ def _distinct(chain: Chain) -> list[Doubt]:
 
 def _kind(doubt: Doubt) -> str:
     why = doubt[1]
-    return FOREIGN[0] if why in FOREIGN else why if why in (SHARED, SEEDED) else CROSSING
+    return FOREIGN[0] if why in FOREIGN else SHARED if why == SHARED else CROSSING
 
 
 def _agreement(pixels: Float64, chain: Float64, rig: StereoRig) -> float:

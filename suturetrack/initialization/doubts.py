@@ -27,14 +27,10 @@ BENT = "a bend as of two strands"
 FADES = "a fainter ridge behind an end"
 HIDDEN = "a hidden stretch"
 """What is seen on both sides of it may be two threads."""
-SEEDED = "a seed where two strands meet"
-"""It may mean the other one."""
 FOREIGN = JOINED, BENT
 """Whether a part is another thread's: what one view shows as the one, the other may as the other."""
 _FOREIGN = 0.45
 """What such a doubt leaves of the confidence."""
-_EITHER = 0.45
-"""What a seed that may mean another strand leaves of it."""
 _HIDDEN = 0.7
 """What a hidden stretch leaves of it."""
 _REASSURANCE = 0.3
@@ -52,17 +48,14 @@ _PARALLEL = 0.7
 _CLEAR, _LEAVES_PX = 0.6, 15.0
 """Strength of such a strand, against the thread's on the weaker side, and how far it comes from, at
 least."""
-_MEANT_PX = 5.0
-"""How far a seed may be from the strand that it means."""
 _SIDE = 40
 """Points of the thread on each side of a place whose strength counts there."""
 
 
-def doubts(merged: Merged, entries: list[int], ridges: Ridges, seed: Float64) -> list[Doubt]:
-    """What is doubtful about the thread of the `seed` (2,) that enters its segments at `entries`; `ridges`
-    are those that were merged."""
-    at_seed = [(seed, SEEDED, _EITHER)] if _passes(merged, entries, ridges, seed) else []
-    return at_seed + [
+def doubts(merged: Merged, entries: list[int], ridges: Ridges) -> list[Doubt]:
+    """What is doubtful about the thread that enters its segments at `entries`; `ridges` are those that
+    were merged."""
+    return [
         (merged.segments[end // 2][-(end % 2)], why, rest)
         for end, why, rest in (
             *_at_merges(merged, entries),
@@ -70,23 +63,6 @@ def doubts(merged: Merged, entries: list[int], ridges: Ridges, seed: Float64) ->
             *_at_tips(merged, entries, ridges),
         )
     ]
-
-
-def _passes(merged: Merged, entries: list[int], ridges: Ridges, seed: Float64) -> bool:
-    """Whether another strand, as clear as the thread, passes the seed as well."""
-    segments, own = merged.segments, {e // 2 for e in entries}
-    level = _CLEAR * float(np.median(ridges.sample(np.concatenate([segments[k] for k in own]))))
-    others = {
-        k: segment
-        for k, segment in enumerate(segments)
-        if k not in own and np.median(ridges.sample(segment)) > level
-    }
-    joins = [
-        np.linspace(others[a // 2][-(a % 2)], others[b // 2][-(b % 2)], _GAP_SAMPLES)
-        for a, b in merged.partner.items()
-        if a // 2 in others and b // 2 in others
-    ]
-    return any(_nearest(line, seed)[1] < _MEANT_PX for line in (*others.values(), *joins))
 
 
 def _at_merges(merged: Merged, entries: list[int]) -> list[tuple[int, str, float]]:

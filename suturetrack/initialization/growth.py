@@ -87,18 +87,14 @@ class Thread:
 
 
 def follow_thread(
-    ridges: Ridges,
-    origin: int,
-    seed: Float64,
-    config: InitializationConfig,
-    depth: Depth | None = None,
+    ridges: Ridges, origin: int, config: InitializationConfig, depth: Depth | None = None
 ) -> Thread:
-    """The merged segments through segment `origin`, the one that the seed (2,) means."""
+    """The merged segments through segment `origin`."""
     merged = merge_ends(ridges, config, depth)
     ridges = replace(ridges, segments=merged.segments)
     entries = _without_faint_ends(ridges, follow(origin, merged.partner), origin)
     pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
-    chain = replace(_join(pieces), doubts=tuple(doubts(merged, entries, ridges, seed)))
+    chain = replace(_join(pieces), doubts=tuple(doubts(merged, entries, ridges)))
     return Thread(ridges, entries, origin, chain)
 
 

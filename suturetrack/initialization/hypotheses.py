@@ -81,7 +81,7 @@ def find_thread(
     apart = (left.chain.pixels - matched.pixels)[matched.inside, 0]
     if len(apart):
         depth = Depth.around(apart, field.left, field.right)
-        left = follow_thread(ridges[0], left.origin, seed, config, depth)
+        left = follow_thread(ridges[0], left.origin, config, depth)
         left = without_faint_tails(left, seed)
         matched = match(left.chain, field.left, field.right, nearest, 1)
     there = matched.pixels[_closest(left.chain.pixels, seed)]
@@ -91,7 +91,6 @@ def find_thread(
     right = follow_thread(
         ridges[1],
         partner,
-        there,
         config,
         Depth.around(-apart, field.right, field.left) if len(apart) else None,
     )
