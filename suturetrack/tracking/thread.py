@@ -69,8 +69,6 @@ class Thread:
         """As it was who followed the thread when that was sure last."""
         self._longest = 0.0
         self._seeded_at = 0.5
-        self._has_left_seed = False
-        """Whether the last look from the pixel of the seed has found nothing that may be the thread."""
         self._rest = self._failures = self._vain = 0
 
     @property
@@ -202,9 +200,8 @@ class Thread:
         is_due = self._may_be_aside and now_ns - self.looked_ns >= _PAUSE_NS
         if not (is_due or self._sureness.asks_for_look(curve, now_ns)):
             return None
-        place, self._has_left_seed = self._place_to_look_from(curve), False
         before = self._who_knows_its_length() if self._vain < _LOOKS else ()
-        return Closer(place, self._setup, curve, before)
+        return Closer(self._place_to_look_from(curve), self._setup, curve, before)
 
     def _who_knows_its_length(self) -> tuple[Follower, ...]:
         """Who follows the thread, and who did when that was sure last: another curve may have been taken
@@ -214,12 +211,7 @@ class Thread:
         return tuple(copy.copy(f) for f in (self._known, self.follower) if f is not None)
 
     def _place_to_look_from(self, curve: Nurbs) -> Seed:
-        """On the curve where it was found; a hopeless one is not what was meant by the seed, which is left
-        behind by what was followed for sure, or has moved where the seed shows nothing any more."""
-        assert self._sureness is not None
-        has_left_seed = self._was_sure or self._has_left_seed
-        if self._sureness.is_hopeless and not has_left_seed:
-            return self._seed
+        """The place of the curve at which it was found: another thread may lie on the seed's pixel by now."""
         x, y, z = (float(c) for c in evaluate(curve, np.array([self._seeded_at]))[0])
         return Seed(self.name, point=(x, y, z))
 
@@ -235,7 +227,6 @@ class Thread:
         if isinstance(search, FromSeed):
             self._take_first(outcome, look.fields)
         elif outcome.pursuit is None or outcome.pursuit.lies_on(others):
-            self._has_left_seed = search.seed is self._seed
             self._vain += isinstance(search, Closer) and not self._is_sure
         elif isinstance(search, Again):
             self._take_again(outcome, search.known_lengths)
