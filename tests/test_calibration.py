@@ -44,6 +44,34 @@ def test_opencv_file_storage_is_read(tmp_path: Path, suffix: str) -> None:
     assert rig.is_rectified
 
 
+@pytest.mark.parametrize("suffix", [".yaml", ".xml", ".json"])
+def test_an_image_size_may_be_a_plain_list_as_cpp_writes_it(tmp_path: Path, suffix: str) -> None:
+    path = write(tmp_path / f"rig{suffix}", ImageSize=None)
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_APPEND)
+    storage.startWriteStruct("ImageSize", cv2.FileNode_SEQ)
+    storage.write("", 640)
+    storage.write("", 480)
+    storage.endWriteStruct()
+    storage.release()
+    assert load_calibration(path).image_size == (640, 480)
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ("ImageSize: [ 640, wide ]", "ImageSize must be"),
+        ("ImageSize: [ 640 ]", r"ImageSize \[640.0\] must be"),
+        ("ImageSize: 640", "no matrix ImageSize"),
+        ("ImageSize:\n   width: 640\n   height: 480", "no matrix ImageSize"),
+    ],
+)
+def test_another_image_size_is_refused(tmp_path: Path, entry: str, words: str) -> None:
+    path = write(tmp_path / "rig.yaml", ImageSize=None)
+    path.write_text(f"{path.read_text()}{entry}\n")
+    with pytest.raises(InputError, match=words):
+        load_calibration(path)
+
+
 @pytest.mark.parametrize(
     ("baseline", "unit", "metres"),
     [(40.0, None, 0.001), (0.04, None, 1.0), (0.4, "mm", 0.001), (40.0, "m", 1.0)],

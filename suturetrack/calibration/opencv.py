@@ -24,7 +24,7 @@ def read(path: Path, unit: str | None, where: str) -> StereoRig:
         raise InputError(f"{where}: not an OpenCV FileStorage file") from error
     try:
         entries = {name: _matrix(storage, name, where, shape) for name, shape in _SHAPES.items()}
-        size = _matrix(storage, "ImageSize", where, None).ravel()
+        size = _image_size(storage, where)
         model = storage.getNode(_MODEL)
         fisheye = not model.empty() and model.string() == "equidistant"
     finally:
@@ -61,11 +61,25 @@ def save_calibration(path: Path | str, rig: StereoRig) -> None:
     storage.release()
 
 
+def _image_size(storage: cv2.FileStorage, where: str) -> Float64:
+    """A matrix, or a plain list, as C++ writes a `cv::Size`."""
+    node = storage.getNode("ImageSize")
+    if not node.isSeq():
+        return _matrix(storage, "ImageSize", where, None).ravel()
+    entries = [node.at(i) for i in range(node.size())]
+    if not all(entry.isInt() or entry.isReal() for entry in entries):
+        raise InputError(f"{where}: ImageSize must be [width, height] in pixels")
+    return np.array([entry.real() for entry in entries])
+
+
 def _matrix(
     storage: cv2.FileStorage, name: str, where: str, shape: tuple[int, int] | None
 ) -> Float64:
     node = storage.getNode(name)
-    value = None if node.empty() else node.mat()
+    try:
+        value = node.mat() if node.isMap() else None
+    except cv2.error:
+        value = None
     if value is None:
         raise InputError(f"{where}: no matrix {name}; it needs K1 D1 K2 D2 R T ImageSize")
     if not np.isfinite(value).all():
