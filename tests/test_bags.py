@@ -335,6 +335,10 @@ def test_images_that_cannot_be_used_are_refused(ros2: Ros) -> None:
         decode(short, "/x")
     broken = ros2.compressed(5, GRAY)
     broken.data = broken.data[:10]
+    empty = ros2.compressed(5, GRAY)
+    empty.data = empty.data[:0]
+    with pytest.raises(InputError, match="cannot be decoded; use jpeg or png"):
+        decode(empty, "/x")
     with pytest.raises(InputError, match="cannot be decoded; use jpeg or png"):
         decode(broken, "/x")
 

@@ -74,7 +74,8 @@ def rig_of_messages(left: Any, right: Any, unit: str | None, where: str) -> Ster
 
 
 def _decode_compressed(message: Any, topic: str) -> Image:
-    image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    data = np.asarray(message.data, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if image is None:
         raise InputError(f"topic {topic}: {message.format!r} cannot be decoded; use jpeg or png")
     if image.dtype != np.uint8:
