@@ -111,6 +111,7 @@ def _state(state: ThreadState) -> None:
     if state.curve is None:
         _require(np.isnan(state.length), "a length without a curve")
     else:
+        _require(len(state.sigma) > 1, f"{len(state.sigma)} deviations along a curve")
         _curve(state.curve)
         _require(np.isfinite(state.length) and state.length >= 0, f"length {state.length}")
 

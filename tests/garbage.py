@@ -86,7 +86,12 @@ def _impossible(kind: type[Any]) -> list[Any]:
     return {
         StereoFrame: [StereoFrame(STAMP, image, image[:24])],
         RidgeField: [RidgeField(STAMP, view, view), RidgeField(STAMP, view * 0 + np.inf, view)],
-        ThreadState: [_state(curve=broken), _state(length=NAN), _state(sigma=np.full(5, NAN))],
+        ThreadState: [
+            _state(curve=broken),
+            _state(length=NAN),
+            _state(sigma=np.full(5, NAN)),
+            _state(sigma=np.empty(0), seen=np.empty(0, bool)),
+        ],
         Truth: [Truth(STAMP, "0", np.full((4, 3), NAN), 0.2, np.ones(4, bool))],
         Seed: [Seed("0", pixel=(NAN, 2.0)), Seed("0", point=(1.0, 2.0, np.inf)), Seed("0")],
         Stamp: [Stamp(-1, 0, 0)],
