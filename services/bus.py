@@ -11,7 +11,7 @@ import time
 import uuid
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 from services import topics, wire
 from services.inbox import Inbox, Stop
@@ -46,8 +46,9 @@ class Transport(Protocol):
     def make_room(self, size: int) -> None:
         """Prepares for large messages of so many bytes, so that the first one is not late."""
 
-    def subscribe(self, pattern: str, deliver: Deliver) -> None:
-        """Calls `deliver(key, packet)` from another thread for every packet that arrives."""
+    def subscribe(self, pattern: str, deliver: Deliver) -> Callable[[], None]:
+        """Calls `deliver(key, packet)` from another thread for every packet that arrives, until what this
+        returns is called."""
 
     def remember(self, pattern: str, kept: Mapping[str, Packet]) -> None:
         """Gives others who ask for `last` what is in `kept`, by key, at that time."""
@@ -77,11 +78,15 @@ class Transport(Protocol):
 class Reader(Generic[T]):
     """A subscription; iterating gives valid messages and ends when the process is asked to stop.
 
+    In a `with` statement it ends with that.
+
     What was sent, from the first to the last message that arrived of each publisher, equals what was read
     plus `passed_over`, `lost`, `refused` and what still waits.
     """
 
     def __init__(self, bus: Bus, topic: Topic[T], depth: int):
+        self.unsubscribe: Callable[[], None] = lambda: None
+        """Ends it; nothing more arrives."""
         self.topic = topic
         self._bus = bus
         self._inbox: Inbox[tuple[str, Packet, int]] = Inbox(bus.stop, depth)
@@ -144,6 +149,12 @@ class Reader(Generic[T]):
         """Counts and reports a bad message."""
         self.refused += 1
         self._bus.complain(f"refused a message: {reason}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.unsubscribe()
 
     def __iter__(self) -> Iterator[T]:
         while (message := self.get()) is not None:
@@ -345,7 +356,14 @@ class Bus:
     def _read(self, topic: Topic[T], depth: int) -> Reader[T]:
         reader = Reader(self, topic, depth)
         self.readers.append(reader)
-        self._transport.subscribe(f"{self._root}/{topics.pattern_of(topic)}", reader.deliver)
+        pattern = f"{self._root}/{topics.pattern_of(topic)}"
+        end = self._transport.subscribe(pattern, reader.deliver)
+
+        def unsubscribe() -> None:
+            end()
+            self.readers.remove(reader)
+
+        reader.unsubscribe = unsubscribe
         return reader
 
     def _wait(self, condition: Callable[[], bool], timeout: float | None) -> bool:

@@ -21,12 +21,12 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar
+from typing import Literal, Self, TypeVar
 
 import numpy as np
 
 from services import topics
-from services.bus import DEPTH, Bus, NoAnswer, Reader
+from services.bus import DEPTH, Bus, NoAnswer
 from services.checks import check, check_name
 from services.freshness import Freshness
 from services.inbox import Inbox
@@ -125,7 +125,6 @@ class Client:
         self._latest: dict[str, Seen] = {}
         self._listeners: dict[Inbox[Seen], str | None] = {}
         self._given_up = 0
-        self._readers: dict[str, Reader[Any]] = {}
         threading.Thread(target=self._listen, name="states", daemon=True).start()
 
     @property
@@ -219,7 +218,7 @@ class Client:
         elif laser:
             frame = self._newest(topics.FRAME)
             pixel = laser_spot(frame.right if view == "right" else frame.left)
-        if view == "right" and pixel is not None and point is None:
+        if view == "right" and pixel is not None:
             point = self._point_of_right(pixel)
             pixel = None
         reply = self._ask(topics.SEED, Seed(thread, pixel, point), timeout)
@@ -304,11 +303,12 @@ class Client:
         return x, y, z
 
     def _newest(self, topic: Topic[T]) -> T:
-        """The next message of a topic; raises Unavailable."""
-        with self._lock:
-            if topic.key not in self._readers:
-                self._readers[topic.key] = self.bus.newest(topic)
-        message: T | None = self._readers[topic.key].get(_ARRIVAL_S)
+        """The next message of a topic; raises Unavailable.
+
+        Images and fields are read no longer than that: a controller's link has room for little else.
+        """
+        with self.bus.newest(topic) as reader:
+            message = reader.get(_ARRIVAL_S)
         if message is None:
             raise Unavailable(
                 f"no {topic.key}s come in which to look; does a {topic.publisher} run?"

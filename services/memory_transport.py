@@ -49,9 +49,11 @@ class MemoryTransport:
     def make_room(self, size: int) -> None:
         """See `Transport`."""
 
-    def subscribe(self, pattern: str, deliver: Deliver) -> None:
+    def subscribe(self, pattern: str, deliver: Deliver) -> Callable[[], None]:
         """See `Transport`."""
-        self.subscriptions.append((pattern, deliver))
+        subscription = pattern, deliver
+        self.subscriptions.append(subscription)
+        return lambda: self.subscriptions.remove(subscription)
 
     def remember(self, pattern: str, kept: Mapping[str, Packet]) -> None:
         """See `Transport`."""

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import zenoh
 
@@ -33,21 +33,27 @@ class Session:
     """
 
     def __init__(self, config: zenoh.Config):
-        self._kept: list[object] = []
+        self._kept: list[Any] = []
         self._threads: set[threading.Thread] = set()
         self.zenoh = _beside(lambda: zenoh.open(config))
         atexit.register(self.close)
 
-    def keep(self, declare: Callable[[zenoh.Session], object]) -> None:
-        """Declares something that calls back, until the session is closed."""
+    def keep(self, declare: Callable[[zenoh.Session], Any]) -> Callable[[], None]:
+        """Declares something that calls back, until the session is closed or what this returns is called."""
 
-        def declared() -> object:
+        def declared() -> Any:
             before = set(threading.enumerate())
             made = declare(self.zenoh)
             self._threads |= {t for t in threading.enumerate() if t.daemon} - before
             return made
 
-        self._kept.append(_beside(declared))
+        def end() -> None:
+            self._kept.remove(kept)
+            _beside(kept.undeclare)
+
+        kept = _beside(declared)
+        self._kept.append(kept)
+        return end
 
     def close(self) -> None:
         """Ends it and the calls back; safe to call twice."""

@@ -174,13 +174,13 @@ class ZenohTransport:
         self._pooled_size = size
         self._pool = _make_pool(size)
 
-    def subscribe(self, pattern: str, deliver: Deliver) -> None:
+    def subscribe(self, pattern: str, deliver: Deliver) -> Callable[[], None]:
         """See `Transport`."""
 
         def arrived(sample: zenoh.Sample) -> None:
             deliver(str(sample.key_expr), _packet(sample))
 
-        self._session.keep(lambda session: session.declare_subscriber(pattern, arrived))
+        return self._session.keep(lambda session: session.declare_subscriber(pattern, arrived))
 
     def remember(self, pattern: str, kept: Mapping[str, Packet]) -> None:
         """See `Transport`."""

@@ -84,6 +84,17 @@ def test_a_reader_of_the_newest_passes_over_the_rest_and_counts_them(connect: Co
     assert (reader.dropped, reader.lost) == (99, 0)
 
 
+def test_a_reader_ends_with_its_block(connect: Connect) -> None:
+    tracker, source = connect("tracker"), connect("source")
+    with source.newest(topics.STEP) as reader:
+        assert tracker.wait_for_readers(topics.STEP, 10)
+        tracker.publish(topics.STEP, stamp(0))
+        assert reader.get(10) is not None
+    wait_until(lambda: not tracker.wait_for_readers(topics.STEP, 0))
+    tracker.publish(topics.STEP, stamp(1))
+    assert (reader.waiting, source.readers) == (0, [])
+
+
 def test_images_cross_unchanged(connect: Connect) -> None:
     source, segmenter = connect("source"), connect("segmenter")
     left, right = np.random.default_rng(0).integers(0, 256, (2, 480, 640, 3), dtype=np.uint8)

@@ -219,18 +219,22 @@ def test_an_area_and_a_laser_spot_seed_at_a_pixel(stage: Stage, rig: StereoRig) 
     stage.tracker.answer(topics.SEED, lambda s: asked.append(s) or SeedReply(s.thread, True, ""))
     for bus in (source, segmenter, stage.tracker):
         bus.declare_alive()
-    images = [np.full((480, 640, 3), 90, np.uint8) for _ in range(2)]
-    cv2.circle(images[0], (320, 200), 5, (255, 255, 255), -1, cv2.LINE_AA)
-    frame = StereoFrame(field.stamp, *images)
 
-    def seed(**where: Any) -> Seed:
-        """While images and fields come, as they do."""
-        done = threading.Event()
+    def lit(place: tuple[int, int]) -> StereoFrame:
+        images = [np.full((480, 640, 3), 90, np.uint8) for _ in range(2)]
+        cv2.circle(images[0], place, 5, (255, 255, 255), -1, cv2.LINE_AA)
+        return StereoFrame(field.stamp, *images)
+
+    def seed(spot: tuple[int, int] = (320, 200), **where: Any) -> Seed:
+        """While images and fields come, as they do, and go on doing so for a moment."""
+        done, frame = threading.Event(), lit(spot)
 
         def play() -> None:
-            while not done.wait(0.01):
+            after = 0
+            while after < 3:
                 source.publish(topics.FRAME, frame)
                 segmenter.publish(topics.FIELD, field)
+                after += done.wait(0.01)
 
         player = threading.Thread(target=play)
         player.start()
@@ -246,7 +250,8 @@ def test_an_area_and_a_laser_spot_seed_at_a_pixel(stage: Stage, rig: StereoRig) 
     assert seed(area=(u - 20, v - 20, u + 20, v + 20)).pixel == pytest.approx(left, abs=21)
     point = seed(area=(x - 20, y - 20, x + 20, y + 20), view="right").point
     assert np.linalg.norm(line - 1000 * np.array(point), axis=1).min() < 2
-    assert seed(laser=True).pixel == pytest.approx((320, 200), abs=0.5)
+    for spot in ((320, 200), (100, 300)):
+        assert seed(spot, laser=True).pixel == pytest.approx(spot, abs=0.5)
     for wrong, where in (
         ("nothing in the area", {"area": (0, 0, 20, 20)}),
         ("no laser spot", {"laser": True, "view": "right"}),
@@ -254,7 +259,10 @@ def test_an_area_and_a_laser_spot_seed_at_a_pixel(stage: Stage, rig: StereoRig) 
     ):
         with pytest.raises(InputError, match=wrong):
             seed(**where)
-    assert len(asked) == 3
+    assert len(asked) == 4
+    # Nothing large is read between the seeds.
+    assert not source.wait_for_readers(topics.FRAME, 0)
+    assert not segmenter.wait_for_readers(topics.FIELD, 0)
     source.close()
     segmenter.close()
 
