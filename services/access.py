@@ -55,7 +55,6 @@ _WATCHED = (
     topics.SNAP,
     topics.HEALTH,
 )
-_ALL_QUESTIONS = (topics.CALIBRATION, topics.SEED, topics.FORGET, topics.GRASP)
 _RECALLED = (topics.STATE, topics.SEEDING)
 
 ROLES = {
@@ -65,7 +64,6 @@ ROLES = {
             "source",
             "releases frames",
             reads=(topics.STEP,),
-            asks=(topics.CALIBRATION,),
             recalls=(topics.STEP,),
             processes=("source",),
         ),
@@ -74,7 +72,7 @@ ROLES = {
             "turns frames into fields",
             reads=(topics.FRAME, topics.SEEDING, topics.DROPPED, topics.STATE),
             asks=(topics.CALIBRATION,),
-            recalls=(topics.SEEDING,),
+            recalls=(topics.STATE,),
             processes=("segmenter",),
         ),
         Role(
@@ -89,7 +87,7 @@ ROLES = {
             "operator",
             "watches, seeds, and asks for grasps",
             reads=(*_WATCHED, topics.TOOL),
-            asks=_ALL_QUESTIONS,
+            asks=QUESTIONS,
             recalls=_RECALLED,
             processes=("run", "client", "console", "tooltip"),
         ),
@@ -98,7 +96,7 @@ ROLES = {
             "bridge",
             "passes states, seeds and grasps on to another system",
             reads=(topics.STATE, topics.HEALTH),
-            asks=_ALL_QUESTIONS,
+            asks=QUESTIONS,
             recalls=_RECALLED,
             processes=("ros2",),
         ),
@@ -139,7 +137,7 @@ def _rules(name: str, rig: str, role: Role, *, said: Flow, heard: Flow) -> list[
     wiring: list[Topic[Any] | Question[Any, Any]]
     published = _keys(role.publishes)
     own = [f"health/{p}" for p in role.processes] + published
-    # Who reads the health of one reads that of all, and says so.
+    # Who reads health subscribes to that of all processes at once, so each has to allow that.
     read_by_others = _keys([topics.HEALTH] if role.processes else []) + published
     read = _keys((*role.reads, *role.keeps))
     served = _keys([*role.answers, *role.keeps])

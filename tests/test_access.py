@@ -10,19 +10,24 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
 
 from services import access, keys, topics
 from services.access import ROLES
+from services.bus import Bus
 from services.client import Client, connect
 from services.keys import Authority, KeysConfig
+from services.service import ServiceConfig
+from services.sources import InputConfig
 from services.status import RigWatch
 from services.topics import QUESTIONS, TOPICS, Question, Topic
 from suturetrack.stage import open_scene
 from suturetrack.types import InputError
 from tests.conftest import wait_until
+from tests.test_tiny import play
 
 Wire = Topic[object] | Question[object, object]
 WIRING = (*TOPICS, *QUESTIONS)
@@ -277,6 +282,33 @@ def test_each_rule_is_needed_by_the_wiring() -> None:
     for question in QUESTIONS:
         assert [r.name for r in ROLES.values() if question in r.answers] == [question.server]
     assert {r.name for r in ROLES.values() if topics.SEED in r.asks} == {"operator", "bridge"}
+
+
+def test_processes_recall_and_ask_no_more_and_no_less_than_they_may(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """When they are started again, which is when most is asked."""
+    recalled, asked = defaultdict[str, set[object]](set), defaultdict[str, set[object]](set)
+    last, ask = Bus.last, Bus.ask
+
+    def spied_last(bus: Bus, topic: Any, *args: Any) -> Any:
+        recalled[bus.process].add(topic)
+        return last(bus, topic, *args)
+
+    def spied_ask(bus: Bus, question: Any, *args: Any, **options: Any) -> Any:
+        asked[bus.process].add(question)
+        return ask(bus, question, *args, **options)
+
+    monkeypatch.setattr(Bus, "last", spied_last)
+    monkeypatch.setattr(Bus, "ask", spied_ask)
+    seed = (open_scene("figure8-107").seed_pixel(0),)
+    _, rig = play(
+        seed, ServiceConfig(lockstep=True, resume=1), InputConfig("stage:figure8-107", frames=2)
+    )
+    assert not rig.errors
+    for process in topics.PROCESSES:
+        assert recalled[process] == set(ROLES[process].recalls)
+        assert asked[process] == set(ROLES[process].asks)
 
 
 def test_keys_are_for_this_user_alone_and_never_overwritten(folder: Path) -> None:
