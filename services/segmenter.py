@@ -43,10 +43,18 @@ class SegmenterConfig:
 
 
 def run(service: Service, config: SegmenterConfig) -> None:
-    """Segments the newest frame, again and again; raises InputError for frames of another rig."""
+    """Segments the newest frame, again and again; frames of another rig are refused."""
     bus = service.bus
     rig = service.calibrated_rig()
     segmenter = Segmenter(rig, config.segmentation)
+
+    def learn(seed: Seed, frame: StereoFrame) -> None:
+        """A seed that cannot be costs no frame."""
+        try:
+            segmenter.learn(frame, seed)
+        except InputError as error:
+            service.complain(f"thread {seed.thread}: nothing is learned of it: {error}")
+
     with compiling():
         segmenter.warm_up()
         example = warm_up(rig, config)
@@ -67,21 +75,22 @@ def run(service: Service, config: SegmenterConfig) -> None:
     service.ready()
     for frame in frames:
         try:
-            while given:
-                segmenter.learn(frame, given.pop(0))
-            for place in held.seeds(frame.stamp) if held is not None else ():
-                segmenter.learn(frame, place)
-            while (drop := drops.get(0)) is not None:
-                segmenter.forget(drop.thread)
-                recorder.request(frame.stamp, drop)
-            while (seed := seedings.get(0)) is not None:
-                segmenter.learn(frame, scaled(seed, 1 / rig.metres_per_unit))
-                recorder.request(frame.stamp, seed)
-            adaptation.catch_up()
-            ridges = segmenter.step(frame)
+            segmenter.check(frame)
         except InputError as error:
             frames.refuse(str(error))
             continue
+        while given:
+            learn(given.pop(0), frame)
+        for place in held.seeds(frame.stamp) if held is not None else ():
+            learn(place, frame)
+        while (drop := drops.get(0)) is not None:
+            segmenter.forget(drop.thread)
+            recorder.request(frame.stamp, drop)
+        while (seed := seedings.get(0)) is not None:
+            learn(scaled(seed, 1 / rig.metres_per_unit), frame)
+            recorder.request(frame.stamp, seed)
+        adaptation.catch_up()
+        ridges = segmenter.step(frame)
         bus.publish(topics.FIELD, ridges)
         recorder.field(ridges, service.finished(frame.stamp))
         adaptation.step(frame)

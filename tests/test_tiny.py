@@ -174,6 +174,21 @@ def test_the_first_curve_does_not_depend_on_where_the_field_lies_in_memory() -> 
     assert len(curves) == 1
 
 
+def test_a_seed_that_cannot_be_costs_the_segmenter_no_frame(
+    seed: tuple[tuple[float, float], ...],
+) -> None:
+    rig = Rig()
+    watcher = rig.connect("run")
+    fields = watcher.every(topics.FIELD)
+    rig.start("source", source, SourceConfig(STAGE, LOCKSTEP))
+    rig.start("segmenter", segmenter, SegmenterConfig(LOCKSTEP, ((-500.0, 20.0), *seed)))
+    rig.start("tracker", tracker, TrackerConfig(LOCKSTEP, seed))
+    rig.wait()
+    rig.stop()
+    assert not rig.errors
+    assert [field.stamp.frame for field in drain(fields)] == list(range(FRAMES))
+
+
 def test_a_seed_on_no_thread_ends_the_tracker_with_the_reason() -> None:
     stage = InputConfig("stage:figure8-107", frames=40)
     _, rig = play(((5.0, 5.0),), stage=stage)

@@ -64,13 +64,27 @@ class Segmenter:
         """Names of the threads whose seeds have taught nothing."""
         return frozenset(self._seeded - self._threads.keys())
 
+    def check(self, frame: StereoFrame) -> None:
+        """Raises InputError unless the images are uint8, gray or BGR, of the rig's size, and alike."""
+        width, height = self._rig.image_size
+        for name, image in (("left", frame.left), ("right", frame.right)):
+            if image.dtype != np.uint8:
+                raise InputError(f"{name} image: {image.dtype} pixels; 8-bit pixels are expected")
+            if image.shape[:2] != (height, width) or image.shape[2:] not in ((), (3,)):
+                raise InputError(
+                    f"{name} image: shape {image.shape}; ({height}, {width}) gray or "
+                    f"({height}, {width}, 3) BGR fits the calibration"
+                )
+        if frame.left.ndim != frame.right.ndim:
+            raise InputError("one image is gray and the other in colour; both must be alike")
+
     def step(self, frame: StereoFrame) -> RidgeField:
         """The field of `frame`, in rectified pixels.
 
         Raises:
-            InputError: the images are not uint8, gray or BGR, of the rig's size, and alike.
+            InputError: as `check`.
         """
-        self._check(frame)
+        self.check(frame)
         frame = self._seen(frame)
         slot = self._steps % SLOTS
         self._steps += 1
@@ -92,9 +106,9 @@ class Segmenter:
         only its outline counts from then on.
 
         Raises:
-            InputError: as `step`, or the seed lies outside the left image.
+            InputError: as `check`, or the seed lies outside the left image.
         """
-        self._check(frame)
+        self.check(frame)
         own = self._config.channel == "learned" and self._config.polarity == "auto"
         self._is_cut_out = own and is_cut_out(frame)
         frame = self._seen(frame)
@@ -125,9 +139,9 @@ class Segmenter:
             where the configuration says so.
 
         Raises:
-            InputError: as `step`.
+            InputError: as `check`.
         """
-        self._check(frame)
+        self.check(frame)
         frame = self._seen(frame)
         width, height = self._rig.image_size
         inside = (pixels >= 0).all(1) & (pixels <= (width - 1, height - 1)).all(1)
@@ -174,19 +188,6 @@ class Segmenter:
             field = sight.step(StereoFrame(Stamp(0, 0, 0), black, black), 0)
             ridge.keep_longer(field[0], field[1])
         smears.keep_longer_of_half(field[0], black, 1.0, field[1])
-
-    def _check(self, frame: StereoFrame) -> None:
-        width, height = self._rig.image_size
-        for name, image in (("left", frame.left), ("right", frame.right)):
-            if image.dtype != np.uint8:
-                raise InputError(f"{name} image: {image.dtype} pixels; 8-bit pixels are expected")
-            if image.shape[:2] != (height, width) or image.shape[2:] not in ((), (3,)):
-                raise InputError(
-                    f"{name} image: shape {image.shape}; ({height}, {width}) gray or "
-                    f"({height}, {width}, 3) BGR fits the calibration"
-                )
-        if frame.left.ndim != frame.right.ndim:
-            raise InputError("one image is gray and the other in colour; both must be alike")
 
     def _seen(self, frame: StereoFrame) -> StereoFrame:
         return silhouettes(frame) if self._is_cut_out else frame
