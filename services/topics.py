@@ -69,11 +69,15 @@ SEEDING = Topic(
     Seed,
     "tracker",
     "every",
-    "the seed from which a thread is looked for",
+    "a seed that was accepted",
     "source",
 )
 DROPPED = Topic(
-    "thread/{thread}/dropped", Forget, "tracker", "every", "what was learned at its seed is void"
+    "thread/{thread}/dropped",
+    Forget,
+    "tracker",
+    "every",
+    "the thread was dropped: what was learned at its seed is void",
 )
 STEP = Topic("step", Stamp, "tracker", "every", "the tracker is done with this frame", "segmenter")
 HEALTH = Topic("health/{process}", Health, "*", "every", "heartbeat, once a second")

@@ -19,7 +19,7 @@ from typing import Any
 
 import tyro
 
-from services import topics, wire
+from services import access, topics, wire
 from services.arguments import FLAT
 from services.cli import VERBS
 from services.topics import Question, Topic
@@ -28,7 +28,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 _TOPICS = """# Topics and schemas
 
-Written by `tools/write_reference.py` from `services/topics.py` and the types that travel.
+Written by `tools/write_reference.py` from `services/topics.py`, `services/access.py` and the types that travel.
 
 All keys stand below `suturetrack/<rig>/`. Each message has an encoding that names its schema and
 version, and an attachment: a MessagePack map with the fields of `Header` below. Frames and fields
@@ -40,6 +40,9 @@ range is refused, counted and logged.
 
 Each process also holds a liveliness token `alive/<process>`. A token is a hint: a hung process keeps
 it. What tells live from stale is the stamp.
+"""
+_ROLES = """What a process may do whose certificate names a role; every role with processes publishes their
+health, too. See [Strangers](deployment.md#strangers).
 """
 _CONFIGURATION = """# Configuration
 
@@ -64,10 +67,19 @@ def topics_page() -> str:
             for q in topics.QUESTIONS
         ),
     )
-    return "\n".join(
-        [_TOPICS, "## Streams\n", streams, "\n## Questions\n", questions, "\n## Messages\n"]
-        + [_message_section(kind) for kind in (wire.Header, *_kinds())]
+    roles = _table(
+        ("role", "publishes", "reads", "asks", "answers", "asks for the last"),
+        (
+            (
+                role.name,
+                *map(_keys, (role.publishes, role.reads, role.asks, role.answers, role.recalls)),
+            )
+            for role in access.ROLES.values()
+        ),
     )
+    parts = [_TOPICS, "## Streams\n", streams, "\n## Questions\n", questions]
+    parts += ["\n## Roles\n", _ROLES, roles, "\n## Messages\n"]
+    return "\n".join(parts + [_message_section(kind) for kind in (wire.Header, *_kinds())])
 
 
 def configuration_page() -> str:
@@ -99,6 +111,10 @@ def _message(kind: type[Any]) -> str:
     if kind is type(None):
         return "nothing"
     return f"[{kind.__name__}](#{kind.__name__.lower()}) `{wire.encoding_of(kind)}`"
+
+
+def _keys(wiring: Iterable[Topic[Any] | Question[Any, Any]]) -> str:
+    return ", ".join(f"`{one.key}`" for one in wiring)
 
 
 def _everyone(topic: Topic[Any] | Question[Any, Any]) -> str:
