@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import metadata
 
 # Each process keeps to one core: they run side by side, and results do not depend on the machine.
 _ONE_THREAD = (
@@ -46,7 +47,9 @@ VERBS = {
     "inspect": _Verb("services.inspect", "InspectConfig", "tables of a run"),
     "compare": _Verb("services.compare", "CompareConfig", "several runs side by side"),
     "replay": _Verb("services.replay", "ReplayConfig", "a run once more through today's code"),
-    "export": _Verb("services.export", "ExportConfig", "the states of a run as JSON lines"),
+    "export": _Verb(
+        "services.export", "ExportConfig", "the states of a run as JSON lines or a table (CSV)"
+    ),
     "view": _Verb("services.view", "ViewConfig", "a run, or what runs now, in the Rerun viewer"),
     "seed": _Verb("services.seed", "SeedConfig", "tell the running tracker where a thread is"),
     "grasp": _Verb("services.grasp", "GraspConfig", "ask where a gripper should take a thread"),
@@ -99,6 +102,9 @@ def call(arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return 0
+    if arguments[0] == "--version":
+        print(f"suturetrack {metadata.version('suturetrack')}")
+        return 0
     name, *options = arguments
     if name not in VERBS:
         print(f"suturetrack: no verb {name!r}; there are {', '.join(VERBS)}", file=sys.stderr)
@@ -145,7 +151,7 @@ def _overview() -> str:
         "usage: suturetrack VERB [OPTIONS]",
         "",
         "Finds a surgical suture thread in stereo video from one seed point and holds a 3-D NURBS",
-        "curve on it. `suturetrack VERB --help` tells the options of a verb.",
+        "curve on it. `suturetrack VERB --help` tells the options of a verb, `--version` which one this is.",
         "",
     ]
     return "\n".join(lines + [f"  {name:<12} {verb.purpose}" for name, verb in VERBS.items()])

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,11 @@ def test_without_a_verb_all_are_listed(capsys: pytest.CaptureFixture[str]) -> No
     assert cli.call([]) == 0
     out = capsys.readouterr().out
     assert all(f"\n  {verb} " in out for verb in cli.VERBS)
+
+
+def test_it_tells_its_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.call(["--version"]) == 0
+    assert capsys.readouterr().out == f"suturetrack {metadata.version('suturetrack')}\n"
 
 
 def test_an_unknown_verb_gets_the_list(call: Call) -> None:
