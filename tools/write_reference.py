@@ -28,7 +28,8 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 _TOPICS = """# Topics and schemas
 
-Written by `tools/write_reference.py` from `services/topics.py`, `services/access.py` and the types that travel.
+Written by `tools/write_reference.py` from `services/topics.py`, `services/access.py` and the types that
+travel.
 
 All keys stand below `suturetrack/<rig>/`. Each message has an encoding that names its schema and
 version, and an attachment: a MessagePack map with the fields of `Header` below. Frames and fields
