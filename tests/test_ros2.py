@@ -352,7 +352,7 @@ def test_a_bridge_that_cannot_be_is_refused(options: dict[str, Any], words: str)
 
 
 class Cameras:
-    """A ROS node that publishes pairs of pictures at 50 Hz until it is closed."""
+    """A ROS node that publishes pairs of pictures stamped at 50 Hz until it is closed."""
 
     def __init__(
         self, config: RosConfig, *, late_ns: int = 0, encoding: str = "bgr8", info: bool = True
@@ -367,8 +367,9 @@ class Cameras:
         ]
 
         def publish() -> None:
-            while not self._stop.wait(0.02):
-                now = time.time_ns()
+            for now in itertools.count(time.time_ns(), 20_000_000):
+                if self._stop.wait(0.02):
+                    return
                 for side in (0, 1):
                     if self.paused.is_set():
                         continue
@@ -399,6 +400,7 @@ def test_image_topics_are_a_source_that_recovers_from_silence(router: str, quick
     footage, rig = open_input(InputConfig(f"ros2:{LEFT},{RIGHT}", ros=config))
     assert footage.live
     assert footage.size == (WIDTH, HEIGHT)
+    assert footage.fps == pytest.approx(50)
     assert rig.baseline == pytest.approx(0.04)
     stamps = []
     for i in range(4):

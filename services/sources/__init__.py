@@ -52,8 +52,8 @@ class InputConfig:
     ros: RosConfig = field(default_factory=RosConfig)
     """Where the ROS 2 graph is."""
     fps: float = 30.0
-    """Frames a second of folders and of the bench top, and what cameras are asked for; videos and bags
-    know theirs."""
+    """Frames a second of folders and of the bench top, and what cameras are asked for; videos and
+    the stamps of ROS tell theirs."""
     frames: int | None = None
     """Stop after so many frames."""
     loop: int | None = None
@@ -124,7 +124,9 @@ def _open_footage(config: InputConfig) -> Footage:
     slop_ns = round(config.slop_ms * 1e6)
     if config.source.startswith(ROS2):
         names = config.source.removeprefix(ROS2).split(",")
-        return Ros2Footage(names, config.ros, slop_ns, wants_rig=config.calibration is None)
+        return Ros2Footage(
+            names, config.ros, slop_ns, config.fps, wants_rig=config.calibration is None
+        )
     if is_bag(Path(config.source)):
         return BagFootage(Path(config.source), config.topics, slop_ns, config.fps)
     size = _given_rig(config).image_size

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
@@ -19,6 +18,7 @@ from services.sources.pairing import (
     Pairing,
     camera_info_topic,
     is_rectified_topic,
+    rate_of,
     stereo_topics,
 )
 from services.sources.ros_image import (
@@ -76,7 +76,7 @@ class BagFootage:
             except InputError as error:
                 raise InputError(f"{self._where}: {error}") from error
             stamps = [p.stamp_ns for p in itertools.islice(self._pairs(), _LOOKED_AT)]
-            self.fps = _rate(stamps, fps)
+            self.fps = rate_of(stamps, fps)
             self.frame_count: int | None = None
             self.rectified = is_rectified_topic(self.topics[0])
             self._rest = self._pairs()
@@ -164,11 +164,6 @@ def _open(path: Path) -> AnyReader:
     except Exception as error:  # whatever a broken file makes the parsers raise
         raise InputError(f"source {path}: not a bag that can be read ({_line(error)})") from error
     return reader
-
-
-def _rate(stamps_ns: list[int], default: float) -> float:
-    period = float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
-    return 1e9 / period if period > 0 else default
 
 
 def _line(error: BaseException) -> str:

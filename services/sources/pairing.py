@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+import numpy as np
+
 from suturetrack.types import InputError
 
 T = TypeVar("T")
@@ -79,6 +81,12 @@ class Pairing(Generic[T]):
         if right:
             return Pair(other_ns, other, image, skipped)
         return Pair(stamp_ns, image, other, skipped)
+
+
+def rate_of(stamps_ns: list[int], default: float) -> float:
+    """Pairs a second by the stamps of some that follow one another; the default where they tell none."""
+    period = float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
+    return 1e9 / period if period > 0 else default
 
 
 def stereo_topics(topics: Iterable[str], given: tuple[str, str] | None) -> tuple[str, str]:

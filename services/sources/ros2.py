@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from typing import Any
 
 from services.ros2_graph import RosConfig, RosNode
 from services.sources.footage import Exposure, Stalled
 from services.sources.live import STALL_S, Newest
-from services.sources.pairing import Pairing, camera_info_topic, is_rectified_topic
+from services.sources.pairing import Pairing, camera_info_topic, is_rectified_topic, rate_of
 from services.sources.ros_image import (
     CAMERA_INFO,
     COMPRESSED,
@@ -22,6 +23,8 @@ from suturetrack.types import InputError
 
 _FIRST_S = 15.0
 _INFO_S = 5.0
+_LOOKED_AT = 10
+"""Pairs at the beginning that tell the frame rate."""
 
 
 class Ros2Footage:
@@ -31,6 +34,7 @@ class Ros2Footage:
         topics: the left and the right one.
         ros: where the graph is.
         slop_ns: how far the stamps of a pair may lie apart.
+        fps: the rate of images that come too seldom to tell it.
         wants_rig: whether `rig` will be asked for.
 
     Raises:
@@ -40,9 +44,10 @@ class Ros2Footage:
     live = True
     frame_count: int | None = None
     seeds: tuple[tuple[float, float], ...] = ()
-    fps = 30.0
 
-    def __init__(self, topics: list[str], ros: RosConfig, slop_ns: int, *, wants_rig: bool):
+    def __init__(
+        self, topics: list[str], ros: RosConfig, slop_ns: int, fps: float, *, wants_rig: bool
+    ):
         if len(topics) != 2:
             raise InputError("source ros2: give two image topics, ros2:/left/image,/right/image")
         self.topics = topics
@@ -56,6 +61,7 @@ class Ros2Footage:
         try:
             self._subscribe(wants_rig=wants_rig)
             self._first: Exposure | None = self._newest.get(_FIRST_S, self._where)
+            self.fps = rate_of(self._next_stamps(self._first), fps)
         except Stalled as stall:
             self.close()
             raise InputError(
@@ -93,6 +99,13 @@ class Ros2Footage:
 
     def _complaint(self) -> str:
         return f"{self._where}: no pair of images ({self._pairing.advice()})"
+
+    def _next_stamps(self, first: Exposure) -> list[int]:
+        stamps = [first.capture_ns]
+        with suppress(Stalled):
+            while len(stamps) < _LOOKED_AT:
+                stamps.append(self._newest.get(STALL_S, self._where).capture_ns)
+        return stamps
 
     def _subscribe(self, *, wants_rig: bool) -> None:
         for right, topic in enumerate(self.topics):
