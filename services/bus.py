@@ -84,10 +84,12 @@ class Reader(Generic[T]):
     plus `passed_over`, `lost`, `refused` and what still waits.
     """
 
-    def __init__(self, bus: Bus, topic: Topic[T], depth: int):
+    def __init__(self, bus: Bus, topic: Topic[T], depth: int, *, at_leisure: bool = False):
         self.unsubscribe: Callable[[], None] = lambda: None
         """Ends it; nothing more arrives."""
         self.topic = topic
+        self.at_leisure = at_leisure
+        """Whether the process goes on as it should while messages wait."""
         self._bus = bus
         self._inbox: Inbox[tuple[str, Packet, int]] = Inbox(bus.stop, depth)
         self.expected: dict[tuple[str, str], int] = {}
@@ -200,8 +202,8 @@ class Bus:
 
     @property
     def newest_waits(self) -> bool:
-        """Whether a frame or field has arrived that the process has not taken yet."""
-        return any(r.waiting for r in self.readers if r.topic.keep == "newest")
+        """Whether a frame or field has arrived that the process should take and has not taken yet."""
+        return any(r.waiting for r in self.readers if r.topic.keep == "newest" and not r.at_leisure)
 
     @property
     def refused(self) -> int:
@@ -221,9 +223,9 @@ class Bus:
         """Prepares for images or fields like this one, so that the first one is not late."""
         self._transport.make_room(len(wire.encode(example).payload))
 
-    def newest(self, topic: Topic[T]) -> Reader[T]:
+    def newest(self, topic: Topic[T], *, at_leisure: bool = False) -> Reader[T]:
         """Reads the newest message each time, passing over those that came in between."""
-        return self._read(topic, 1)
+        return self._read(topic, 1, at_leisure=at_leisure)
 
     def every(self, topic: Topic[T]) -> Reader[T]:
         """Reads every message in order."""
@@ -353,8 +355,8 @@ class Bus:
             raise WireError("the key names something else than the message")
         return message
 
-    def _read(self, topic: Topic[T], depth: int) -> Reader[T]:
-        reader = Reader(self, topic, depth)
+    def _read(self, topic: Topic[T], depth: int, *, at_leisure: bool = False) -> Reader[T]:
+        reader = Reader(self, topic, depth, at_leisure=at_leisure)
         self.readers.append(reader)
         pattern = f"{self._root}/{topics.pattern_of(topic)}"
         end = self._transport.subscribe(pattern, reader.deliver)

@@ -34,8 +34,8 @@ class LiveView:
     def __init__(self, bus: Bus, rig: StereoRig, writers: Sequence[Writer | Recorder]) -> None:
         self._rig = rig
         self._source, self._segmenter, self._tracker = writers
-        self._frames = bus.newest(topics.FRAME)
-        self._fields = bus.newest(topics.FIELD)
+        self._frames = bus.newest(topics.FRAME, at_leisure=True)
+        self._fields = bus.newest(topics.FIELD, at_leisure=True)
         self._states = bus.every(topics.STATE)
         self._truths = bus.every(topics.TRUTH)
         self._healths = bus.every(topics.HEALTH)

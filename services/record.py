@@ -38,7 +38,7 @@ def run(service: Service, config: RecordConfig) -> None:
         ]
         save_calibration(folder / "calibration.yaml", rig)
         view = LiveView(service.bus, rig, recorders)
-        service.bus.declare_alive()
+        service.ready()
         while not service.bus.stop.is_set:
             view.step()
     print(f"Open it with: suturetrack view {folder}")

@@ -68,7 +68,7 @@ def run(service: Service, config: TooltipConfig) -> None:
     if not radius > 0:
         raise InputError(f"radius {config.radius}: use more than 0mm")
     tip = _Tip(service.bus, service.calibrated_rig(), hand_eye, config, radius)
-    service.bus.declare_alive()
+    service.ready()
     while not service.bus.stop.is_set:
         tip.step()
 
@@ -110,7 +110,8 @@ class _Tip:
     ):
         self._bus, self._rig, self._hand_eye = bus, rig, hand_eye
         self._tool, self._thread, self._radius = config.tool, config.thread, radius
-        self._poses, self._fields = bus.every(topics.TOOL), bus.newest(topics.FIELD)
+        self._poses = bus.every(topics.TOOL)
+        self._fields = bus.newest(topics.FIELD, at_leisure=True)
         self._field: RidgeField | None = None
         self._field_ns = 0
         self._held = True

@@ -5,14 +5,24 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import yaml
 
+from services import console, record, tooltip, topics
+from services.bus import Bus
+from services.memory_transport import Hub
 from services.messages import Health
+from services.service import Service, ServiceConfig
 from services.watchdog import Watchdog
+from suturetrack.camera import StereoRig
+from suturetrack.types import Nurbs
+from tests.test_live import publish_frame
 from tests.test_pulse import beat, unready
 
 SAID = b"READY=1\nWATCHDOG=1"
@@ -74,6 +84,49 @@ def test_a_beginning_may_take_longer_but_not_for_ever(systemd: Systemd) -> None:
         assert systemd.is_told(dog, unready("tracker", awaits="source"))
     told = [systemd.is_told(dog, unready("tracker")) for _ in range(300)]
     assert told == 180 * [True] + 120 * [False]
+
+
+def run_console(service: Service, folder: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(console, "run_service", lambda _name, _config, body: body(service))
+        patch.setattr("os.nice", lambda _: None)
+        console.run(console.ConsoleConfig(port=0))
+
+
+def run_record(service: Service, folder: Path) -> None:
+    record.run(service, record.RecordConfig(replace(service.config, run_dir=folder / "run")))
+
+
+def run_tooltip(service: Service, folder: Path) -> None:
+    hand_eye = folder / "hand_eye.yaml"
+    hand_eye.write_text(yaml.safe_dump({"camera_from_base": np.eye(4).tolist()}))
+    tooltip.run(service, tooltip.TooltipConfig(hand_eye))
+
+
+@pytest.mark.parametrize("run", [run_console, run_record, run_tooltip])
+def test_who_reads_at_leisure_is_ready_and_fed_for_though_frames_wait(
+    run: Callable[[Service, Path], None],
+    systemd: Systemd,
+    tmp_path: Path,
+    rig: StereoRig,
+    curve: Nurbs,
+) -> None:
+    hub, name = Hub(), run.__name__.removeprefix("run_")
+    speaker = Bus(hub.connect(), "rig", "tracker")
+    speaker.answer(topics.CALIBRATION, lambda _: rig)
+    service = Service(name, ServiceConfig(), Bus(hub.connect(), "rig", name))
+    running = threading.Thread(target=run, args=(service, tmp_path), daemon=True)
+    running.start()
+    assert speaker.wait_for_alive(name, 30)
+    assert service.health().ready
+    dog = Watchdog()
+    for i in range(30):
+        publish_frame(speaker, i, curve, rig)
+        waits = service.bus.newest_waits
+        assert systemd.is_told(dog, service.health(), work_waits=waits)
+    service.bus.close()
+    running.join(30)
+    speaker.close()
 
 
 def test_without_systemd_nothing_is_said(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:

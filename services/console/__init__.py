@@ -46,7 +46,7 @@ def run(config: ConsoleConfig) -> None:
         os.nice(_NICE)
         recording = Recording(config.rig, config.zenoh)
         feed = Feed(service.bus, recording)
-        service.bus.declare_alive()
+        service.ready()
         try:
             serve(feed, config.host, config.port, token)
         finally:

@@ -49,8 +49,8 @@ class Feed:
         self.watched = threading.Event()
         """Set while somebody looks."""
         self.rig: StereoRig | None = None
-        self._frames = bus.newest(topics.FRAME)
-        self._fields = bus.newest(topics.FIELD)
+        self._frames = bus.newest(topics.FRAME, at_leisure=True)
+        self._fields = bus.newest(topics.FIELD, at_leisure=True)
         self._healths = bus.every(topics.HEALTH)
         self._health: dict[str, Health] = {}
         self._field: RidgeField | None = None
