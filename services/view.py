@@ -24,6 +24,9 @@ from services.service import ServiceConfig
 from services.service import run as run_service
 from suturetrack.types import InputError
 
+_PAUSE_S = 0.1
+"""Between two questions for a rig, which nobody answers at once while none runs."""
+
 
 @dataclass(frozen=True)
 class ViewConfig:
@@ -72,7 +75,7 @@ def _follow(bus: Bus, web: bool) -> None:
     )
     try:
         rig = None
-        while rig is None and window.poll() is None and not bus.stop.is_set:
+        while rig is None and window.poll() is None and not bus.stop.wait(_PAUSE_S):
             with suppress(NoAnswer):
                 rig = bus.ask(topics.CALIBRATION, None, timeout=1.0)
         if rig is None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 import rerun as rr
 
-from services import topics
+from services import topics, view
 from services.bus import Bus
 from services.live import LiveView
 from services.memory_transport import Hub
@@ -72,3 +74,27 @@ def test_what_is_published_is_shown(tmp_path: Path, rig: StereoRig, curve: Nurbs
     overlays = [r for r in folder.rows("/rig/left/image/curve") if "frame" in r]
     assert [len(r["LineStrips2D:strips"]) for r in overlays] == [2, 2]
     assert [r for r in folder.rows("/rig/left/image/direction") if "frame" in r]
+
+
+class Window:
+    """A viewer that is closed after some looks at whether it is."""
+
+    def __init__(self, looks: int):
+        self.looks = looks
+
+    def poll(self) -> int | None:
+        self.looks -= 1
+        return None if self.looks >= 0 else 0
+
+    def terminate(self) -> None: ...
+
+    def wait(self) -> None: ...
+
+
+def test_a_view_of_no_rig_waits_for_one_without_haste(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = Bus(Hub().connect(), "rig", "view")
+    monkeypatch.setattr(view.subprocess, "Popen", lambda *_, **__: Window(10))
+    began = time.monotonic()
+    view._follow(bus, web=True)
+    assert time.monotonic() - began > 0.5
+    bus.close()
