@@ -9,10 +9,10 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
@@ -23,7 +23,7 @@ from rich.text import Text
 from services.status import RigWatch, watch_rigs
 from services.tables import new_table
 from services.topics import PROCESSES
-from services.zenoh_transport import socket_directory
+from services.zenoh_transport import load_config, socket_directory
 from suturetrack.types import InputError
 
 OK, WARNING, ERROR = "ok", "warning", "error"
@@ -101,14 +101,10 @@ def certificates(zenoh: Path) -> Iterator[Finding]:
     Raises:
         InputError: the file cannot be read.
     """
-    try:
-        settings = json.loads(zenoh.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"zenoh {zenoh}: not readable as JSON ({error})") from error
-    tls: dict[str, Any] = settings.get("transport", {}).get("link", {}).get("tls", {})
-    if not tls:
+    tls = json.loads(load_config(zenoh).get_json("transport/link/tls"))
+    paths = {Path(v) for k, v in tls.items() if k.endswith("certificate") and v is not None}
+    if not paths:
         yield Finding(WARNING, "certificates", f"{zenoh.name} names none", "suturetrack keys init")
-    paths = {Path(v) for k, v in tls.items() if k.endswith("certificate") and isinstance(v, str)}
     for path in sorted(paths):
         yield _certificate(path)
 
@@ -166,8 +162,9 @@ def _shared_memory() -> Finding:
 
 def _sockets() -> Finding:
     try:
-        base = socket_directory("doctor")
-        base.rmdir()
+        base = socket_directory(".doctor")  # no rig can have this name
+        with suppress(OSError):  # another doctor may have been quicker
+            base.rmdir()
     except InputError as error:
         return Finding(ERROR, "sockets", str(error), "XDG_RUNTIME_DIR names another place")
     return Finding(OK, "sockets", f"in {base.parent}, this user's alone")

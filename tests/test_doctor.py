@@ -31,6 +31,7 @@ from services.messages import Health, Latency
 from services.status import StatusConfig, run, watch_rigs
 from services.zenoh_transport import ZenohTransport, local_config, local_rigs
 from suturetrack.types import Energies, InputError, Stamp, Status, ThreadState
+from tests.test_deploy import DEPLOY
 
 HEALTHY = Health(
     process="source",
@@ -133,8 +134,20 @@ def test_certificates_near_their_end_are_named(tmp_path: Path) -> None:
     (folder / "rig-tracker.pem").write_text("nonsense")
     levels = {f.subject: f.level for f in certificates(folder / "rig-tracker.json5")}
     assert levels["certificate rig-tracker.pem"] == ERROR
-    with pytest.raises(InputError, match="not readable"):
+    with pytest.raises(InputError, match="no file"):
         list(certificates(tmp_path / "none.json5"))
+
+
+def test_a_configuration_with_comments_is_read() -> None:
+    (found,) = certificates(DEPLOY / "host.json5")
+    assert (found.level, found.text) == (WARNING, "host.json5 names none")
+
+
+def test_a_rig_may_have_the_doctors_name(rig_name: str) -> None:
+    bus = Bus(ZenohTransport(local_config("doctor", "source")), "doctor", "source")
+    levels = {f.subject: f.level for f in examine(DoctorConfig("doctor"))}
+    assert levels["sockets"] == OK
+    bus.close()
 
 
 def test_status_shows_processes_and_threads(rig: Bus, capsys: pytest.CaptureFixture[str]) -> None:
