@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
+import sys
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -29,6 +31,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.types import (
     Energies,
+    InputError,
     Nurbs,
     RidgeField,
     Seed,
@@ -37,6 +40,7 @@ from suturetrack.types import (
     StereoFrame,
     ThreadState,
 )
+from tests.conftest import wait_until
 from tests.painting import paint, thread
 
 PERIOD_NS = 33_333_333
@@ -370,3 +374,27 @@ def test_images_are_made_only_while_somebody_looks(stage: Stage) -> None:
             assert len(delivered) <= 1
 
     asyncio.run(flow())
+
+
+TALKER = f"""#!{sys.executable}
+import pathlib, signal, sys
+signal.signal(signal.SIGINT, lambda *_: sys.exit("record: the disk is full"))
+sys.stderr.write(1_000_000 * "a warning\\n")
+pathlib.Path("said").touch()
+signal.pause()
+"""
+
+
+def test_a_recording_may_say_much_and_its_last_word_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "talker"
+    program.write_text(TALKER)
+    program.chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.chdir(tmp_path)
+    recording = Recording("rig", None)
+    recording.start()
+    wait_until((tmp_path / "said").exists)
+    with pytest.raises(InputError, match="failed: record: the disk is full"):
+        recording.stop()

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections import deque
 from pathlib import Path
 
 from services.arguments import arguments_of
@@ -25,6 +26,9 @@ class Recording:
         self._lock = threading.Lock()
         self._child: subprocess.Popen[str] | None = None
         self._folder = Path()
+        self._said = deque[str](maxlen=1)
+        """The last line on the child's stderr."""
+        self._listener = threading.Thread()
 
     @property
     def folder(self) -> Path | None:
@@ -50,6 +54,12 @@ class Recording:
                 text=True,
                 start_new_session=True,
             )
+            # A pipe that nobody reads would fill and hold the child up.
+            self._said.clear()
+            self._listener = threading.Thread(
+                target=self._said.extend, args=(self._child.stderr,), daemon=True
+            )
+            self._listener.start()
             return self._folder
 
     def stop(self) -> Path:
@@ -58,16 +68,19 @@ class Recording:
             child, self._child = self._child, None
             if child is None:
                 raise InputError("nothing is recorded")
-            if child.poll() is None:
-                child.send_signal(signal.SIGINT)
-            try:
-                _, complaint = child.communicate(timeout=_STOP_S)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                _, complaint = child.communicate()
+            with child:
+                if child.poll() is None:
+                    child.send_signal(signal.SIGINT)
+                try:
+                    child.wait(_STOP_S)
+                except subprocess.TimeoutExpired:
+                    child.kill()
+                self._listener.join()
             if child.returncode:
-                last = complaint.strip().splitlines() or [f"status {child.returncode}"]
-                raise InputError(f"the recording to {self._folder} failed: {last[-1]}")
+                # Who was killed could not say why.
+                explains = self._said and child.returncode > 0
+                reason = self._said[0].strip() if explains else f"status {child.returncode}"
+                raise InputError(f"the recording to {self._folder} failed: {reason}")
             return self._folder
 
     def close(self) -> None:
