@@ -187,7 +187,8 @@ class Recorder:
         self._file = None
 
     def _hand_over(self, task: Callable[[RunFile], None]) -> None:
-        if self._file is None or self._file.problem is not None:
+        file = self._file  # which another thread may close
+        if file is None or file.problem is not None:
             return
         while not self._gives_up():
             try:

@@ -94,6 +94,7 @@ class Service:
         self._ready = False
         self._unrecorded: deque[Health] = deque(maxlen=8)
         self._complaints: deque[str] = deque(maxlen=8)
+        """Those from before the recording."""
         self._last_complaint = float("-inf")
         self._heartbeat = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
         bus.complain = self.complain
@@ -120,6 +121,8 @@ class Service:
         run_dir, level = self.config.run_dir, self.config.recording
         patient = self.config.lockstep
         self.recorder = Recorder(run_dir, self.name, level, rig, config, patient=patient)
+        while self._complaints:
+            self.recorder.log(self._complaints.popleft(), "WARN")
         return self.recorder
 
     def ready(self) -> None:
@@ -133,18 +136,19 @@ class Service:
         now_ns = time.time_ns()
         self.meter.count(stamp, now_ns)
         if self.recorder is not None:
-            while self._complaints:
-                self.recorder.log(self._complaints.popleft(), "WARN")
             while self._unrecorded:
                 self.recorder.health(self._unrecorded.popleft())
         return now_ns
 
     def complain(self, text: str) -> None:
-        """Logs a warning, at most one a second; those in between are counted in the health."""
+        """Logs and records a warning, at most one a second; those in between are counted in the health."""
         now = time.monotonic()
         if now - self._last_complaint >= _COMPLAINT_INTERVAL_S:
             self._last_complaint = now
-            self._complaints.append(text)
+            if self.recorder is None:
+                self._complaints.append(text)
+            else:
+                self.recorder.log(text, "WARN")
             log.warning("%s", text)
 
     def health(self) -> Health:

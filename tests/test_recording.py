@@ -20,10 +20,13 @@ import pytest
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
+from services.bus import Bus
 from services.drawing import Level
+from services.memory_transport import Hub
 from services.messages import Health, Latency
 from services.recording import Recorder
 from services.run_folder import RunFolder
+from services.service import Service, ServiceConfig
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Growth, Initialization, InitializationError, ViewGrowth
@@ -290,6 +293,22 @@ def test_the_log_warns_of_every_loss(tmp_path: Path, rig: StereoRig, curve: Nurb
     lines = rows(RunFolder(tmp_path), "/log/tracker")
     warnings = [r["frame"] for r in lines if r["TextLog:level"][0] == "WARN"]
     assert warnings == [3, 6]
+
+
+def test_warnings_are_recorded_though_no_frame_is_finished(
+    tmp_path: Path, rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("services.service._COMPLAINT_INTERVAL_S", 0)
+    bus = Bus(Hub().connect(), "rig", "segmenter")
+    with Service("segmenter", ServiceConfig(run_dir=tmp_path), bus) as service:
+        bus.complain("no kernels were cached")
+        service.record(rig, None)
+        bus.complain("refused a message: it is of another rig")
+    lines = [row for row in RunFolder(tmp_path).rows("/log/segmenter") if "TextLog:text" in row]
+    assert [(line["TextLog:text"][0], line["TextLog:level"][0]) for line in lines] == [
+        ("segmenter: no kernels were cached", "WARN"),
+        ("segmenter: refused a message: it is of another rig", "WARN"),
+    ]
 
 
 def test_the_growth_can_be_followed_step_by_step(
