@@ -122,6 +122,7 @@ class _Pace:
     ):
         self._service, self._footage = service, footage
         self._frames = frames
+        self._end = min(frames or math.inf, footage.frame_count or math.inf)
         self._patient = service.config.lockstep or footage.live
         self._index, self._began = _beginning(left_off, footage)
         self.last: int | None = None
@@ -158,7 +159,7 @@ class _Pace:
         return None
 
     def _skip(self) -> None:
-        due = int((time.monotonic() - self._began) * self._footage.fps)
+        due = int(min((time.monotonic() - self._began) * self._footage.fps, self._end))
         if due > self._index + _BUFFERED:
             self._service.meter.skipped += due - self._index
             self._index = due

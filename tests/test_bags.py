@@ -163,12 +163,17 @@ def test_images_without_a_partner_are_left_out(tmp_path: Path, ros2: Ros) -> Non
     lost = {(LEFT, START_NS + PERIOD_NS), (RIGHT, START_NS + 2 * PERIOD_NS)}
     entries = [e for e in frames(ros2) if (e[1], e[0] - 1_000_000) not in lost]
     assert len(entries) == 4 * COUNT - 2
-    footage, _ = open_input(InputConfig(str(write(tmp_path / "run.mcap", ros2, entries))))
+    path = write(tmp_path / "run.mcap", ros2, entries)
+    footage, _ = open_input(InputConfig(str(path)))
     seen = [footage.read(i) for i in range(4)]
     assert [told(e.left)[0] for e in seen if e is not None] == [0, 3, 4]
     assert [told(e.right)[0] for e in seen if e is not None] == [0, 3, 4]
     assert [e.skipped for e in seen if e is not None] == [0, 2, 0]
     footage.close()
+    looped, _ = open_input(InputConfig(str(path), loop=3))
+    again = [looped.read(i) for i in range(8)]
+    assert [e.skipped for e in again if e is not None] == [0, 2, 0, 0, 0, 0, 0, 0]
+    looped.close()
 
 
 def refused(path: Path, words: str, **options: Any) -> None:

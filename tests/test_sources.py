@@ -6,6 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from services.bus import Bus
+from services.memory_transport import Hub
+from services.service import Service, ServiceConfig
+from services.source import _Pace
 from services.sources import InputConfig, open_input
 from services.sources.footage import Footage
 from suturetrack.calibration import save_calibration
@@ -191,3 +195,16 @@ def test_a_loop_goes_there_and_back_in_rising_time(tmp_path: Path, calibration: 
     assert [e.capture_ns for e in exposures if e][-1] == round(4001 * 1e9 / 30)
     with pytest.raises(InputError, match="--loop 7"):
         open_input(InputConfig(**options, loop=7))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("frames", [None, COUNT - 1, 2 * COUNT])
+def test_what_lies_beyond_the_end_was_not_skipped(
+    tmp_path: Path, calibration: Path, frames: int | None
+) -> None:
+    write_folder(tmp_path / "pairs")
+    service = Service("source", ServiceConfig(), Bus(Hub().connect(), "rig", "source"))
+    pace = _Pace(service, open_footage(tmp_path / "pairs", calibration), frames, None)
+    first = next(pace)
+    pace._began -= 60.0  # as after a suspension
+    given = [first, *pace]
+    assert len(given) + service.meter.skipped == min(frames or COUNT, COUNT)

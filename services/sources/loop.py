@@ -33,7 +33,9 @@ class LoopFootage:
             if exposure is None:
                 return None
             self._exposures.append(exposure)
-        return replace(self._exposures[place], capture_ns=round(index * 1e9 / self.fps))
+        exposure = self._exposures[place]
+        skipped = exposure.skipped if index == place else 0  # counted on the first way there
+        return replace(exposure, capture_ns=round(index * 1e9 / self.fps), skipped=skipped)
 
     def close(self) -> None:
         """See `Footage`."""
