@@ -231,13 +231,13 @@ class Bus:
         """Reads every message in order."""
         return self._read(topic, DEPTH)
 
-    def keep(self, topic: Topic[T], worth: Callable[[T], bool] = lambda _: True) -> None:
-        """Remembers the last message of every key that is worth it, for others to have by `last`.
-
-        The first one is always worth it.
-        """
+    def keep(
+        self, topic: Topic[T], replaces: Callable[[T, T], bool] = lambda _new, _kept: True
+    ) -> None:
+        """Remembers a message of every key, for others to have by `last`: the last that replaces its own."""
         pattern = f"{self._root}/{topics.pattern_of(topic)}"
         kept: dict[str, Packet] = {}
+        opened: dict[str, T] = {}
 
         def deliver(key: str, packet: Packet) -> None:
             try:
@@ -246,11 +246,8 @@ class Bus:
                 self.refused_kept += 1
                 self.complain(f"refused a message: {key}: {error}")
                 return
-            if key in kept:
-                if worth(message):
-                    kept[key] = packet
-            elif len(kept) < _MOST_KEPT:
-                kept[key] = packet
+            if replaces(message, opened[key]) if key in kept else len(kept) < _MOST_KEPT:
+                kept[key], opened[key] = packet, message
 
         self._transport.subscribe(pattern, deliver)
         self._transport.remember(pattern, kept)

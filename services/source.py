@@ -55,7 +55,7 @@ def run(service: Service, config: SourceConfig) -> None:
     first = footage.read(0)
     if first is not None:
         bus.make_room(StereoFrame(Stamp(0, 0, 0), first.left, first.right))
-    bus.keep(topics.STATE, _is_worth_keeping)
+    bus.keep(topics.STATE, _is_worth_more)
     bus.keep(topics.SEEDING)
     service.ready()
     if not footage.live:
@@ -165,9 +165,10 @@ class _Pace:
             self._index = due
 
 
-def _is_worth_keeping(state: ThreadState) -> bool:
-    """Whether a tracker that is started again can use it: where the thread is, or that it is dropped."""
-    return state.status is not Status.LOST or FORGOTTEN in state.events
+def _is_worth_more(state: ThreadState, kept: ThreadState) -> bool:
+    """Whether it tells a tracker that is started again where the thread is, or is not any more: dropped,
+    or looked for anew."""
+    return state.status is not Status.LOST or FORGOTTEN in (*state.events, *kept.events)
 
 
 def _left_off(service: Service) -> Stamp | None:

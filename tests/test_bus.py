@@ -222,7 +222,7 @@ def test_gaps_in_the_numbers_are_lost_messages(connect: Connect) -> None:
 
 def test_the_last_messages_outlive_their_sender(connect: Connect) -> None:
     source, tracker = connect("source"), connect("tracker")
-    source.keep(topics.SEEDING, lambda seed: seed.pixel != (9.0, 9.0))
+    source.keep(topics.SEEDING, lambda seed, _: seed.pixel != (9.0, 9.0))
     assert tracker.wait_for_readers(topics.SEEDING, 10)
     for thread, u in (("a", 1.0), ("b", 9.0), ("a", 2.0), ("b", 3.0), ("b", 9.0)):
         tracker.publish(topics.SEEDING, Seed(thread, pixel=(u, u)))

@@ -1,0 +1,39 @@
+"""Seeds outlive the tracker that was given them, unless their thread was dropped."""
+
+from __future__ import annotations
+
+import pytest
+
+from services import topics
+from services.bus import Bus
+from services.memory_transport import Hub
+from services.seeding import SeedDesk
+from services.source import _is_worth_more
+from services.wire import scaled
+from suturetrack.camera import StereoRig
+from suturetrack.tracking import Tracker
+from suturetrack.tracking.thread import not_found
+from suturetrack.tracking.tracker import FORGOTTEN
+from suturetrack.types import Seed, Stamp
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_seed_is_taken_up_when_it_came_after_its_thread_was_dropped(
+    rig: StereoRig, again: bool
+) -> None:
+    hub = Hub()
+    source, before, after = (Bus(hub.connect(), "rig", n) for n in ("source", *2 * ("tracker",)))
+    source.keep(topics.STATE, _is_worth_more)
+    source.keep(topics.SEEDING)
+    events: tuple[tuple[str, ...], ...] = ((), (FORGOTTEN,), *again * ((),))
+    for i, each in enumerate(events):
+        if not each:
+            before.publish(topics.SEEDING, Seed("a", pixel=(320.0, 240.0)))
+        state = not_found("a", Stamp(i, i, i), each)
+        before.publish(topics.STATE, scaled(state, rig.metres_per_unit))
+    before.close()
+    tracker = Tracker(rig)
+    SeedDesk(after, tracker, rig).resume([])
+    assert tracker.is_sought("a") == again
+    after.close()
+    source.close()
