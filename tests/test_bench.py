@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from services.bench import report, segmentation
+from services.bench import BenchConfig, report, segmentation
+from services.bench import run as bench
 from services.bench.initialization import InitializationBench
 from services.bench.initialization import rows as initialization_rows
 from services.bench.segmentation import SegmentationBench
@@ -194,6 +195,16 @@ def test_rows_are_printed_and_written_whole(tmp_path: Path) -> None:
     assert page.count("<tr>") == 31
     assert "data:image/png;base64," in page
     assert "http" not in page
+
+
+@pytest.mark.parametrize("path", [".", "none/rows"])
+@pytest.mark.parametrize("option", ["json", "page"])
+def test_what_cannot_be_written_is_said_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str, path: str
+) -> None:
+    monkeypatch.setattr("services.bench.tracking.run", lambda *_: pytest.fail("it began"))
+    with pytest.raises(InputError, match="cannot write"):
+        bench(BenchConfig(TrackingBench(), **{option: tmp_path / path}))
 
 
 def test_workers_end_with_a_killed_benchmark() -> None:

@@ -80,7 +80,14 @@ class BenchConfig:
 
 
 def run(config: BenchConfig) -> None:
-    """Runs one benchmark, prints its rows, and writes what was asked for."""
+    """Runs one benchmark, prints its rows, and writes what was asked for.
+
+    Raises:
+        InputError: what was asked for cannot be written, or the benchmark cannot be run.
+    """
+    for path in (config.json, config.page):
+        if path is not None:
+            report.check_writable(path)
     console = Console()
     table: list[object]
     match config.what:

@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+
+from suturetrack.types import InputError
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,12 @@ def print_rows(console: Console, title: str, rows: Sequence[Any]) -> None:
     )
     console.print(table, crop=False)
     console.width = width
+
+
+def check_writable(path: Path) -> None:
+    """Raises InputError, before the work is done, where a file could not be written."""
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise InputError(f"cannot write {path}: name a file in a folder that is there")
 
 
 def write_json(path: Path, tables: Mapping[str, Sequence[Any]]) -> None:
