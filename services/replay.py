@@ -73,23 +73,30 @@ def run(config: ReplayConfig) -> None:
     """Replays the run.
 
     Raises:
-        InputError: the run cannot be read or lacks what is needed, or a parameter is wrong.
+        InputError: the run cannot be read or lacks what is needed, a parameter is wrong, the new run
+            cannot be written, or a process failed, as for a seed on no thread.
     """
     folder = RunFolder(config.run)
     parameters = changed(_recorded_parameters(config.run), config.set)
     new = config.run_dir or _beside(config.run)
     if new.is_dir() and any(new.glob("*.rrd")):
         raise InputError(f"run folder {new} holds a run already; give another --run-dir")
-    level = next(iter(folder.about().values()))["level"]
+    level = next((about["level"] for about in folder.about().values()), None)
+    if level is None:
+        raise InputError(f"{config.run}: no recording tells at which level it was made")
     if config.from_ == "tracker" and level != "full":
         raise InputError(f"{config.run}: recorded {level}; --from tracker needs full")
     if level != "full":
         print(
             f"{config.run} was recorded {level}: its frames are JPEG, results may differ a little"
         )
-    new.mkdir(parents=True, exist_ok=True)
-    write_config(parameters, new / "config.toml")
-    save_calibration(new / "calibration.yaml", folder.rig())
+    rig = folder.rig()
+    try:
+        new.mkdir(parents=True, exist_ok=True)
+        write_config(parameters, new / "config.toml")
+        save_calibration(new / "calibration.yaml", rig)
+    except OSError as error:
+        raise InputError(f"run folder {new}: {error.strerror}") from error
     service = ServiceConfig(run_dir=new, recording=config.recording, lockstep=True)
     _replay(folder, parameters, service, config.from_)
     print(f"Replayed to {new}; compare: suturetrack compare {config.run} {new}")
@@ -236,10 +243,12 @@ class _Worker:
         self._wait_for(lambda: self._bus.wait_for_alive(self._part.name, 0.1), _READY_S)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._service.bus.stop.set()
         self._thread.join()
         self._bus.close()
+        if kind is None and self._error is not None:
+            raise self._error
 
     def step(self, message: Any) -> Any:
         """What the process makes of a message; None for a frame that it never worked on."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
+import rerun as rr
 
 from services import segmenter, topics, tracker
 from services.arguments import write_config
@@ -18,10 +19,12 @@ from services.memory_transport import Hub
 from services.messages import Forget
 from services.recording import Recorder
 from services.replay import Parameters, ReplayConfig, changed, run
+from services.run_file import APPLICATION
 from services.run_folder import RecordedState, RunFolder
 from services.segmenter import SegmenterConfig
 from services.service import Service, ServiceConfig
 from services.tracker import TrackerConfig
+from services.writer import Writer
 from suturetrack.camera import StereoRig
 from suturetrack.stage import open_scene
 from suturetrack.types import InputError, Seed, Stamp, StereoFrame, ThreadState
@@ -216,3 +219,24 @@ def test_what_cannot_be_replayed_is_said(tmp_path: Path, recorded: Path) -> None
     (light / "config.toml").unlink()
     with pytest.raises(InputError, match=r"config\.toml is missing"):
         run(ReplayConfig(light, tmp_path / "new"))
+    with pytest.raises(InputError, match="Not a directory"):
+        run(ReplayConfig(recorded, recorded / "config.toml" / "new"))
+
+
+def test_a_seed_that_is_not_found_by_the_end_fails_a_replay_too(
+    tmp_path: Path, recorded: Path
+) -> None:
+    with pytest.raises(InputError, match=r"seed \(5\.0, 5\.0\)"):
+        run(ReplayConfig(recorded, tmp_path / "new", set=("seed=[[5.0, 5.0]]",)))
+
+
+def test_a_recording_that_tells_nothing_of_itself_is_not_replayed(
+    tmp_path: Path, rig: StereoRig
+) -> None:
+    stream = rr.RecordingStream(APPLICATION, recording_id="bare")
+    stream.set_sinks(rr.FileSink(str(tmp_path / "source.rrd")))
+    Writer(stream, "source", "light", rig).describe()
+    stream.disconnect()
+    write_config(Parameters(), tmp_path / "config.toml")
+    with pytest.raises(InputError, match="no recording tells at which level"):
+        run(ReplayConfig(tmp_path, tmp_path / "new"))
