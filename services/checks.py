@@ -19,7 +19,7 @@ from services.messages import (
     ToolPose,
     ToolSnap,
 )
-from suturetrack.camera import Camera, StereoRig
+from suturetrack.camera import LARGEST_SIDE, Camera, StereoRig
 from suturetrack.types import (
     Energies,
     Grasp,
@@ -197,7 +197,8 @@ def _health(health: Health) -> None:
 
 def _rig(rig: StereoRig) -> None:
     width, height = rig.image_size
-    _require(1 <= min(width, height) <= max(width, height) <= 16384, f"image_size {rig.image_size}")
+    fits = 1 <= min(width, height) <= max(width, height) <= LARGEST_SIDE
+    _require(fits, f"image_size {rig.image_size}")
     _require(0 < rig.metres_per_unit < np.inf, f"metres_per_unit {rig.metres_per_unit}")
     for side, camera in (("left", rig.left), ("right", rig.right)):
         _camera(camera, side)

@@ -29,7 +29,7 @@ from services.messages import (
     ToolPose,
     ToolSnap,
 )
-from suturetrack.camera import StereoRig
+from suturetrack.camera import LARGEST_SIDE, StereoRig
 from suturetrack.segmentation import joined
 from suturetrack.types import (
     Grasp,
@@ -46,8 +46,6 @@ T = TypeVar("T")
 
 LARGEST_SMALL_MESSAGE = 1 << 20
 """Bytes of a MessagePack payload and of an attachment; a state of 100 control points has 5 kB."""
-LARGEST_SIDE = 8192
-"""Pixels."""
 MOST_THREADS = 64
 """With a field of their own."""
 

@@ -13,6 +13,9 @@ from suturetrack.types import Float32, Float64, Image, InputError
 
 Pixels = TypeVar("Pixels", Image, Float32)
 
+LARGEST_SIDE = 8192
+"""Of an image, px."""
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:

@@ -330,6 +330,7 @@ def with_points(value: float) -> Nurbs:
         dataclasses.replace(rig(), metres_per_unit=math.nan),
         dataclasses.replace(rig(), right=rig().left),
         dataclasses.replace(rig(), image_size=(0, 480)),
+        dataclasses.replace(rig(), image_size=(9216, 480)),
         dataclasses.replace(HEALTH, rate_hz=math.nan),
         dataclasses.replace(HEALTH, process="a b"),
     ],

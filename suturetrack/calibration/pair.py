@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from suturetrack.camera import StereoRig
+from suturetrack.camera import LARGEST_SIDE, StereoRig
 from suturetrack.types import Float64, InputError
 
 METRES_PER_UNIT = {"m": 1.0, "mm": 0.001}
@@ -81,8 +81,10 @@ def metres_per_unit(unit: str | None, baseline: float) -> float:
 
 def check_lens(lens: Lens, image_size: tuple[int, int], where: str) -> None:
     """Raises InputError, naming the entry, for a camera that cannot be."""
-    if min(image_size) < 16 or max(image_size) > 16384:
-        raise InputError(f"{where}: ImageSize {list(image_size)} must be [width, height] in pixels")
+    if min(image_size) < 16 or max(image_size) > LARGEST_SIDE:
+        raise InputError(
+            f"{where}: ImageSize {list(image_size)} must be [width, height], 16 to {LARGEST_SIDE} px"
+        )
     (name, distortion_name), k, size = lens.names, lens.matrix, np.array(image_size)
     if k[0, 0] <= 0 or k[1, 1] <= 0:
         raise InputError(f"{where}: {name} has a focal length that is not positive")
