@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from services import topics
 from services.bus import NoAnswer
 from services.checks import check_name
+from services.freshness import Freshness
 from services.ros2_graph import RosConfig, RosNode, new
 from services.service import Service, ServiceConfig
 from suturetrack import nurbs
@@ -76,7 +77,7 @@ def run(service: Service, config: Ros2Config) -> None:
             if state is None:
                 status.publish(_diagnostics(config, None, seeds.said))
             elif state.thread in threads:
-                threads[state.thread].publish(state)
+                threads[state.thread].publish(state, states.arrived_ns)
                 status.publish(_diagnostics(config, state, seeds.said))
                 service.finished(state.stamp)
     finally:
@@ -93,7 +94,7 @@ class _Thread:
         self._marker = node.publisher(f"{root}/marker", "visualization_msgs/msg/Marker")
         self._grasp = node.publisher(f"{root}/grasp", "geometry_msgs/msg/PoseStamped")
 
-    def publish(self, state: ThreadState) -> None:
+    def publish(self, state: ThreadState, arrived_ns: int) -> None:
         config = self._config
         header = _header(state.stamp, config.frame_id)
         held = state.curve if state.status is not Status.LOST else None
@@ -101,6 +102,8 @@ class _Thread:
         poses = _ros_poses(points, frames)
         self._curve.publish(new("geometry_msgs/msg/PoseArray", header=header, poses=poses))
         self._marker.publish(_marker(state, points, header, config.width_mm))
+        if not Freshness.of(state.stamp, arrived_ns).live:
+            return
         try:
             pose = grasp(state, GraspPoint(fraction=config.grasp_at))
         except InputError:

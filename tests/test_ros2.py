@@ -141,7 +141,7 @@ def state(curve: Nurbs) -> ThreadState:
     """A thread in metres whose last third is not seen."""
     metres = replace(curve, control_points=curve.control_points / 1000)
     seen = np.arange(12) < 8
-    stamp = Stamp(7, 1_700_000_000_123_456_789, 0)
+    stamp = Stamp(7, 1_700_000_000_123_456_789, time.time_ns(), 10_000_000_000)
     length = nurbs.length(metres)
     return ThreadState(
         stamp, "0", Status.TRACKING, metres, length, Energies(), np.full(12, 1e-4), seen
@@ -281,6 +281,18 @@ def test_a_lost_thread_is_shown_nowhere_and_silence_is_told(
     assert (entry.level, entry.message) in ((2, "lost"), (3, "no states come"))
     assert not listener.of(GRASP)
     wait_until(lambda: listener.message("/diagnostics", KINDS["/diagnostics"]).status[0].level == 3)
+
+
+@pytest.mark.parametrize("stale", [{"released_ns": 0}, {"period_ns": 0}])
+def test_a_stale_state_gives_no_grasp(
+    bridge: tuple[Bridge, Listener], state: ThreadState, stale: dict[str, int]
+) -> None:
+    running, listener = bridge
+    running.tracker.publish(topics.STATE, replace(state, stamp=replace(state.stamp, **stale)))
+    assert listener.message(CURVE, KINDS[CURVE]).poses
+    running.tracker.publish(topics.STATE, replace(state, status=Status.LOST))
+    wait_until(lambda: len(listener.of(CURVE)) == 2)
+    assert not listener.of(GRASP)
 
 
 def point(frame_id: str, *xyz: float) -> Any:
