@@ -38,7 +38,7 @@ from services.zenoh_transport import (
 )
 from suturetrack.calibration import save_calibration
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import InitializationConfig, seed_pixel
+from suturetrack.initialization import InitializationConfig
 from suturetrack.segmentation import SegmentationConfig
 from suturetrack.tracking import TrackingConfig
 from suturetrack.types import InputError, Seed
@@ -123,7 +123,7 @@ def _resolve(config: RunConfig, rig_name: str) -> tuple[RunConfig, StereoRig]:
         load_config(config.service.zenoh)
     seeds = config.seed or footage.seeds
     for pixel in seeds:
-        seed_pixel(Seed(pixel=pixel), rig)
+        rig.locate(Seed(pixel=pixel))
     run_dir = config.service.run_dir or _fresh_folder(config.input.source)
     shared = replace(config.service, rig=rig_name, run_dir=run_dir.absolute())
     service = ServiceConfig(**vars(shared), parent=os.getpid())

@@ -12,7 +12,7 @@ from services.messages import Forget, Forgotten, SeedReply
 from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import Initialization, InitializationError, seed_pixel
+from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.tracking import Tracker
 from suturetrack.tracking.tracker import FORGOTTEN
 from suturetrack.types import InputError, Seed, Stamp
@@ -59,7 +59,7 @@ class SeedDesk:
         self._tracker.seed(seed)
 
     def _open(self, seed: Seed, request: Request[Seed, SeedReply] | None) -> _Case:
-        seed_pixel(seed, self._rig)
+        self._rig.locate(seed)
         before = self._cases.pop(seed.thread, None)
         if before is not None:
             _answer(before, SeedReply(seed.thread, False, "another seed took its place"))

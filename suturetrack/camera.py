@@ -9,7 +9,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from suturetrack.types import Float32, Float64, Image, InputError
+from suturetrack.types import Float32, Float64, Image, InputError, Seed
 
 Pixels = TypeVar("Pixels", Image, Float32)
 
@@ -212,6 +212,26 @@ class StereoRig:
         if self.is_rectified:
             return np.asarray(pixels, float)
         return _distort(self.right if right else self.left, np.asarray(pixels, float))
+
+    def locate(self, seed: Seed) -> Float64:
+        """(2,) rectified left pixel of a seed.
+
+        Raises:
+            InputError: it is outside the image, or behind the camera.
+        """
+        if seed.point is not None:
+            point = np.asarray(seed.point, float)
+            if not point[2] > 0:
+                raise InputError(f"seed {seed.point}: it is behind the camera; z must be positive")
+            pixel = self.project(point)[0]
+        else:
+            pixel = self.rectify_pixels(np.asarray(seed.pixel, float))
+        width, height = self.image_size
+        if not (-0.5 <= pixel[0] <= width - 0.5 and -0.5 <= pixel[1] <= height - 0.5):
+            raise InputError(
+                f"seed ({pixel[0]:.0f}, {pixel[1]:.0f}) is outside the {width}x{height} left image"
+            )
+        return pixel
 
     def triangulate(self, left: Float64, right: Float64) -> Float64:
         """(..., 2) rectified pixels of both views -> (..., 3) points in the rectified left frame.

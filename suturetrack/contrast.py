@@ -121,12 +121,12 @@ def channel_means(image: Image) -> Float64:
     return np.array(np.broadcast_to(means.ravel(), 3))
 
 
-def contrast_at(image: Image, pixel: tuple[float, float]) -> Contrast | None:
+def contrast_at(image: Image, pixel: Float64) -> Contrast | None:
     """The contrast of the thread that runs within 8 px of `pixel`; None where nothing does.
 
     Args:
         image: (H, W, 3) BGR or (H, W) gray, uint8.
-        pixel: (u, v) in that image.
+        pixel: (2,) in that image.
     """
     shown = [_shown(image, pixel, octave) for octave in range(len(SIGMAS))]
     found = [s for s in shown if s is not None and s.score >= _LEAST_SCORE]
@@ -188,7 +188,7 @@ class _Shown:
     """Length of the second derivative across, over the channels."""
 
 
-def _shown(image: Image, pixel: tuple[float, float], octave: int) -> _Shown | None:
+def _shown(image: Image, pixel: Float64, octave: int) -> _Shown | None:
     """The ridge that stands out most near the seed, in the image halved `octave` times."""
     crop, seed = _window(*_shrunk(image, pixel, octave))
     scene = _Scene.of(crop, SIGMAS[0])
@@ -201,12 +201,12 @@ def _shown(image: Image, pixel: tuple[float, float], octave: int) -> _Shown | No
     return _Shown(octave, _Ridge(ridge.pixels - seed, ridge.normals), score, response)
 
 
-def _shrunk(image: Image, pixel: tuple[float, float], octave: int) -> tuple[Image, Float64]:
+def _shrunk(image: Image, pixel: Float64, octave: int) -> tuple[Image, Float64]:
     """The image halved `octave` times, and where the pixel is in it."""
     height, width = image.shape[:2]
     size = max(width >> octave, 1), max(height >> octave, 1)
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if octave else image
-    return small, (np.array(pixel) + 0.5) * np.array(size) / (width, height) - 0.5
+    return small, (pixel + 0.5) * np.array(size) / (width, height) - 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,13 +270,11 @@ def _scatter(hessian: Float64) -> Float64:
     return np.asarray(scatter + _FLOOR * np.eye(len(scatter)))
 
 
-def _window(
-    image: Image, pixel: tuple[float, float] | Float64, half: int = _WINDOW_PX
-) -> tuple[Image, Float64]:
+def _window(image: Image, pixel: Float64, half: int = _WINDOW_PX) -> tuple[Image, Float64]:
     """The image around a pixel, and where the pixel is in it."""
     u, v = (round(float(x)) for x in pixel)
     left, top = max(u - half, 0), max(v - half, 0)
-    return image[top : v + half, left : u + half], np.array(pixel) - (left, top)
+    return image[top : v + half, left : u + half], pixel - (left, top)
 
 
 def _starts(scene: _Scene, seed: Float64, reach: float) -> list[tuple[int, int]]:

@@ -111,9 +111,23 @@ def test_a_seed_on_nothing_is_refused_with_the_nearest_ridge(rig: StereoRig, cur
     assert nearest.max() < 2
 
 
-def test_a_seed_outside_the_image_is_refused(rig: StereoRig, curve: Nurbs) -> None:
-    with pytest.raises(InputError, match="outside the 640x480 left image"):
-        initialize(field_of_curve(curve, rig), rig, Seed(pixel=(700.0, 20.0)))
+@pytest.mark.parametrize(
+    ("seed", "words"),
+    [
+        (Seed(pixel=(700.0, 20.0)), "outside the 640x480 left image"),
+        (Seed(point=(0.0, 0.0, -200.0)), "behind the camera"),
+    ],
+)
+def test_a_seed_that_no_image_shows_is_refused(
+    rig: StereoRig, curve: Nurbs, seed: Seed, words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        initialize(field_of_curve(curve, rig), rig, seed)
+
+
+def test_a_seed_on_the_outermost_half_pixel_is_in_the_image(rig: StereoRig, curve: Nurbs) -> None:
+    with pytest.raises(InitializationError, match="no thread within 8 px"):
+        initialize(field_of_curve(curve, rig), rig, Seed(pixel=(639.3, 20.0)))
 
 
 def test_a_right_view_without_the_thread_is_refused(rig: StereoRig, curve: Nurbs) -> None:

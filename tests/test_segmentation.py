@@ -469,7 +469,7 @@ def test_a_seed_on_nothing_teaches_nothing(scene: Scene) -> None:
     far = np.array([[u, v] for u in range(40, 600, 40) for v in range(40, 440, 40)], float)
     distance = np.linalg.norm(far[:, None] - thread_pixels(scene), axis=2).min(1)
     image = scene.render(0)[0]
-    nothing = [tuple(pixel) for pixel in far[distance > 40]]
+    nothing = far[distance > 40]
     assert len(nothing) > 20
     assert sum(contrast_at(image, pixel) is not None for pixel in nothing) <= len(nothing) // 20
 
@@ -513,19 +513,18 @@ def test_a_wide_thread_gets_a_wide_filter() -> None:
         (13.0, 3.0, 6.0),
         (20.0, 5.0, 9.0),
     ):
-        contrast = contrast_at(line_image(0.3, width, size=641), (320.0, 320.0))
+        contrast = contrast_at(line_image(0.3, width, size=641), np.array([320.0, 320.0]))
         assert contrast is not None
         assert lowest <= contrast.sigma <= highest
 
 
 def test_an_enlarged_picture_shows_the_same_thread(scene: Scene) -> None:
     image, pixel = scene.render(0)[0], np.array(scene.seed_pixel())
-    small = contrast_at(image, (pixel[0], pixel[1]))
+    small = contrast_at(image, pixel)
     assert small is not None
     for times in (4, 6):
         large = cv2.resize(image, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC)
-        u, v = (pixel + 0.5) * times - 0.5
-        found = contrast_at(large, (u, v))
+        found = contrast_at(large, (pixel + 0.5) * times - 0.5)
         assert found is not None
         assert 0.35 < found.sigma / (times * small.sigma) < 1.7
         assert small.stands_out(found.weights) > 0.8 * small.stands_out(small.weights)
@@ -606,7 +605,7 @@ def test_threads_that_cross_near_a_seed_are_seen_together(number: int) -> None:
         u, v = np.rint(pixels).astype(int).T
         assert np.median(np.linalg.norm(field.left[v, u], axis=-1)) > 0.35
         seed = scene.rig.rectify_pixels(np.array(scene.seed_pixel(0, truth.thread)))
-        learned = contrast_at(image, (float(seed[0]), float(seed[1])))
+        learned = contrast_at(image, seed)
         assert learned is not None
         right = contrast_along(image, pixels, learned.sigma).across
         assert np.linalg.norm(learned.across - right) < 0.25 * np.linalg.norm(right)
@@ -772,11 +771,24 @@ def test_images_that_do_not_fit_are_refused(left, right, words: str) -> None:
             act(frame)
 
 
-@pytest.mark.parametrize("seed", [Seed(pixel=(700.0, 5.0)), Seed(point=(0.0, 900.0, 200.0))])
-def test_a_seed_outside_the_image_is_refused(seed: Seed) -> None:
-    blank = np.zeros((480, 640, 3), np.uint8)
-    with pytest.raises(InputError, match="outside the left image of 640x480"):
-        Segmenter(make_rig()).learn(StereoFrame(STAMP, blank, blank), seed)
+def test_a_seed_that_no_image_shows_is_refused() -> None:
+    segmenter, blank = Segmenter(make_rig()), np.zeros((480, 640, 3), np.uint8)
+    for seed, words in (
+        (Seed(pixel=(700.0, 5.0)), "outside the 640x480 left image"),
+        (Seed(point=(0.0, 900.0, 200.0)), "outside the 640x480 left image"),
+        (Seed(point=(0.0, 0.0, -200.0)), "behind the camera"),
+    ):
+        with pytest.raises(InputError, match=words):
+            segmenter.learn(StereoFrame(STAMP, blank, blank), seed)
+
+
+@pytest.mark.parametrize("u", [-0.4, 639.3])
+def test_a_seed_on_the_outermost_half_pixel_teaches_its_thread(u: float) -> None:
+    image = np.full((480, 640, 3), 200, np.uint8)
+    cv2.line(image, (0, 240), (639, 240), (40, 40, 40), 3)
+    segmenter = Segmenter(make_rig())
+    segmenter.learn(StereoFrame(STAMP, image, image), Seed(pixel=(u, 240.0)))
+    assert segmenter.threads == ("0",)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,6 @@ from suturetrack.initialization import (
     Initialization,
     InitializationError,
     ViewGrowth,
-    seed_pixel,
 )
 from suturetrack.types import Float32, Float64, Image, RidgeField, Seed, Stamp
 
@@ -73,7 +72,7 @@ def cleared(field: RidgeField, rig: StereoRig) -> Iterator[Entry]:
 
 def seed(seed: Seed, rig: StereoRig) -> Iterator[Entry]:
     """Where the growth begins; lengths in the calibration's unit."""
-    u, v = rig.raw_pixels(seed_pixel(seed, rig)[None])[0]
+    u, v = rig.raw_pixels(rig.locate(seed)[None])[0]
     label = f"seed of thread {seed.thread}"
     mark = rr.Points2D([[u, v]], colors=BLUE, radii=-5.0, labels=label)
     yield f"/rig/left/{_ROOT}/{part(seed.thread)}/seed", mark

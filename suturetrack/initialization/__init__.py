@@ -26,7 +26,7 @@ from suturetrack.initialization.model import (
 )
 from suturetrack.initialization.segments import Ridges, find_ridges, thread_scale
 from suturetrack.nurbs import curve_from
-from suturetrack.types import Float32, Float64, InputError, Nurbs, RidgeField, Seed
+from suturetrack.types import Float32, Float64, Nurbs, RidgeField, Seed
 
 __all__ = [
     "Growth",
@@ -56,10 +56,10 @@ def initialize(
     """Finds the whole thread that `seed` lies on.
 
     Raises:
-        InputError: the seed is outside the image.
+        InputError: the seed is outside the image, or behind the camera.
         InitializationError: there is no thread at the seed, or none like it in the right view.
     """
-    pixel = seed_pixel(seed, rig)
+    pixel = rig.locate(seed)
     left = find_ridges(field.left, config)
     scale = thread_scale(left, pixel)
     if scale == 1:
@@ -190,27 +190,6 @@ def _reduced(view: Float32, scale: int) -> Float32:
     # As fields from the wire are: kernels are compiled apart for arrays that may be written to.
     reduced.flags.writeable = False
     return reduced
-
-
-def seed_pixel(seed: Seed, rig: StereoRig) -> Float64:
-    """(2,) the seed in the rectified left view.
-
-    Raises:
-        InputError: it is outside the image, or behind the camera.
-    """
-    if seed.point is not None:
-        point = np.asarray(seed.point, float)
-        if not point[2] > 0:
-            raise InputError(f"seed {seed.point}: it is behind the camera; z must be positive")
-        pixel = rig.project(point)[0]
-    else:
-        pixel = rig.rectify_pixels(np.asarray(seed.pixel, float))
-    width, height = rig.image_size
-    if not (-0.5 <= pixel[0] <= width - 0.5 and -0.5 <= pixel[1] <= height - 0.5):
-        raise InputError(
-            f"seed ({pixel[0]:.0f}, {pixel[1]:.0f}) is outside the {width}x{height} left image"
-        )
-    return pixel
 
 
 def _trim(pixels: Float64, left: Ridges) -> Float64:

@@ -106,15 +106,14 @@ class Segmenter:
         only its outline counts from then on.
 
         Raises:
-            InputError: as `check`, or the seed lies outside the left image.
+            InputError: as `check`, or the seed is outside the left image, or behind the camera.
         """
         self.check(frame)
         own = self._config.channel == "learned" and self._config.polarity == "auto"
         self._is_cut_out = own and is_cut_out(frame)
         frame = self._seen(frame)
         image = self._rig.rectify(frame.left, frame.right)[0]
-        pixel = self._locate(seed)
-        contrast = contrast_at(image, pixel)
+        contrast = contrast_at(image, self._rig.locate(seed))
         self._seeded.add(seed.thread)
         if contrast is not None:
             if self._is_cut_out:
@@ -191,18 +190,6 @@ class Segmenter:
 
     def _seen(self, frame: StereoFrame) -> StereoFrame:
         return silhouettes(frame) if self._is_cut_out else frame
-
-    def _locate(self, seed: Seed) -> tuple[float, float]:
-        if seed.pixel is not None:
-            u, v = self._rig.rectify_pixels(np.array(seed.pixel, float))
-        else:
-            u, v = self._rig.project(np.array(seed.point, float))[0]
-        width, height = self._rig.image_size
-        if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
-            raise InputError(
-                f"seed at ({u:.0f}, {v:.0f}) px: outside the left image of {width}x{height}"
-            )
-        return float(u), float(v)
 
     def _look_for(self, thread: str, contrast: Contrast) -> None:
         self._threads[thread] = contrast
