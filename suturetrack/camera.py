@@ -197,15 +197,16 @@ class StereoRig:
 
     def rectify_pixels(self, pixels: Float64, *, right: bool = False) -> Float64:
         """(..., 2) pixels of a raw image -> (..., 2) rectified pixels of the same view."""
-        if self.is_rectified:
-            return np.asarray(pixels, float)
+        pixels = np.asarray(pixels, float)
+        if self.is_rectified or not pixels.size:  # OpenCV has no answer for no points.
+            return pixels
         camera = self.right if right else self.left
-        flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
+        flat = np.ascontiguousarray(pixels).reshape(-1, 1, 2)
         undistort = cv2.fisheye.undistortPoints if camera.fisheye else cv2.undistortPoints
         rectified = undistort(
             flat, camera.matrix, camera.distortion, R=camera.rectification, P=camera.projection
         )
-        return rectified.reshape(np.shape(pixels))
+        return rectified.reshape(pixels.shape)
 
     def raw_pixels(self, pixels: Float64, *, right: bool = False) -> Float64:
         """(..., 2) rectified pixels of a view -> (..., 2) pixels of its raw image."""
@@ -292,6 +293,8 @@ def _jacobian(projection: Float64, points: Float64) -> Float64:
 
 
 def _distort(camera: Camera, pixels: Float64) -> Float64:
+    if not pixels.size:
+        return pixels
     p = camera.projection
     rays = np.concatenate(
         [(pixels - p[:2, 2]) / p[[0, 1], [0, 1]], np.ones_like(pixels[..., :1])], -1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -37,6 +39,26 @@ def test_raw_pixels_rectify_to_the_projections(distorted_rig: StereoRig) -> None
     assert np.abs(raw_left - left).max() > 2
     assert np.allclose(distorted_rig.rectify_pixels(raw_left), left, atol=0.02)
     assert np.allclose(distorted_rig.rectify_pixels(raw_right, right=True), right, atol=0.02)
+
+
+@pytest.mark.parametrize("shape", [(0,), (0, 4), (3, 0), (1,), (5,), (2, 3), ()])
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_as_many_pixels_come_back_as_went_in(
+    distorted_rig: StereoRig, shape: tuple[int, ...], fisheye: bool
+) -> None:
+    if fisheye:
+        left, right = (
+            replace(camera, distortion=camera.distortion[:4], fisheye=True)
+            for camera in (distorted_rig.left, distorted_rig.right)
+        )
+        distorted_rig = replace(distorted_rig, left=left, right=right)
+    points = np.broadcast_to(POINTS[0], (*shape, 3))
+    for right_view, pixels in enumerate(distorted_rig.project(points)):
+        raw = distorted_rig.raw_pixels(pixels, right=bool(right_view))
+        assert raw.shape == (*shape, 2)
+        np.testing.assert_array_equal(raw, distorted_rig.project_raw(points)[right_view])
+        back = distorted_rig.rectify_pixels(raw, right=bool(right_view))
+        np.testing.assert_allclose(back, pixels, atol=0.02)
 
 
 def test_raw_projection_is_the_camera_model(distorted_rig: StereoRig) -> None:

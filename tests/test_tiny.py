@@ -13,19 +13,22 @@ import numpy as np
 import pytest
 
 from services import segmenter, source, topics, tracker
-from services.bus import Bus, NoAnswer
+from services.bus import Bus, NoAnswer, Request
 from services.memory_transport import Hub
-from services.messages import Forget, Health
+from services.messages import Forget, Health, SeedReply
+from services.seeding import SeedDesk
 from services.segmenter import SegmenterConfig
 from services.service import Service, ServiceConfig
 from services.source import SourceConfig
 from services.sources import InputConfig
 from services.tracker import TrackerConfig
 from suturetrack import nurbs
+from suturetrack.camera import StereoRig
 from suturetrack.initialization import initialize
 from suturetrack.metrics import curve_error
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
+from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.types import RidgeField, Seed, Stamp, Status, StereoFrame, ThreadState, Truth
 
 FRAMES = 8
@@ -193,6 +196,20 @@ def test_a_seed_on_no_thread_ends_the_tracker_with_the_reason() -> None:
     stage = InputConfig("stage:figure8-107", frames=40)
     _, rig = play(((5.0, 5.0),), stage=stage)
     assert "seed (5.0, 5.0)" in str(rig.errors["tracker"])
+
+
+def test_a_seed_on_an_image_without_ridges_is_answered(distorted_rig: StereoRig) -> None:
+    replies: list[SeedReply] = []
+    follower = Tracker(distorted_rig, TrackingConfig(patience=1))
+    desk = SeedDesk(Bus(Hub().connect(), "rig", "tracker"), follower, distorted_rig, at_once=True)
+    desk.seed(Seed(pixel=(320.0, 240.0)), Request(Seed(), replies.append))
+    nothing = np.zeros((480, 640, 2), np.float32)
+    field = RidgeField(Stamp(0, 0, 0), nothing, nothing)
+    desk.settle(field.stamp, follower.step(field).initializations)
+    (reply,) = replies
+    assert not reply.accepted
+    assert "no ridge at all" in reply.reason
+    assert reply.candidates == ()
 
 
 def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
