@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import stat
 from collections.abc import Callable, Mapping
@@ -124,7 +125,7 @@ def load_config(path: Path) -> zenoh.Config:
     try:
         return zenoh.Config.from_file(str(path))
     except zenoh.ZError as error:
-        raise InputError(f"zenoh {path}: {_first_line(error)}") from error
+        raise InputError(f"zenoh {path}: {_fault(str(error))}") from error
 
 
 def sweep_shared_memory() -> None:
@@ -332,7 +333,7 @@ def _packet(message: zenoh.Sample | zenoh.Query) -> Packet:
 
 def explain(error: zenoh.ZError) -> str:
     """What went wrong when a session was opened, on one line."""
-    text = _first_line(error)
+    text = _first_line(str(error))
     if "Unable to acquire lock" in text:
         socket = Path(text.partition(" listener on ")[2].partition(" - ")[0])
         return (
@@ -342,5 +343,17 @@ def explain(error: zenoh.ZError) -> str:
     return f"zenoh: {text}"
 
 
-def _first_line(error: zenoh.ZError) -> str:
-    return str(error).splitlines()[0].partition(" at /")[0]
+def _fault(text: str) -> str:
+    """What Zenoh finds wrong in a configuration file, on one line."""
+    syntax = re.match(r" *--> (\d+):(\d+)", text)
+    if syntax is not None:
+        return f"not valid JSON5 at line {syntax[1]}, column {syntax[2]}"
+    entry = re.search(r'msg: "(.*)", location: Some\(Location { line: (\d+), column: (\d+)', text)
+    if entry is not None:
+        reason = entry[1].replace('\\"', '"').partition(" at /")[0]
+        return f"line {entry[2]}, column {entry[3]}: {reason}"
+    return _first_line(text)
+
+
+def _first_line(text: str) -> str:
+    return text.splitlines()[0].partition(" at /")[0]

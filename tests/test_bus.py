@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -389,9 +390,31 @@ def test_a_configuration_file_replaces_the_default(tmp_path: Path) -> None:
         transport.close()
     with pytest.raises(InputError, match="no file"):
         load_config(tmp_path / "missing.json5")
-    file.write_text('{mode: "pear"}')
-    with pytest.raises(InputError, match=r"net\.json5"):
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("{ garbage", "not valid JSON5 at line 1, column 1"),
+        (
+            '{mode: "client",\n connect: {endpoints: [1,}}',
+            "not valid JSON5 at line 2, column [0-9]+",
+        ),
+        ('{mode: "pear"}', "line 1, column 8: unknown variant `pear`, expected .*`client`"),
+        (
+            '{connect: {timeout_ms: "x"}}',
+            'line 1, column 24: invalid type: string "x", expected .*',
+        ),
+        ('{connect: {endpoints: ["x"]}}', "line 1, column [0-9]+: Endpoints must be .*: x"),
+        ("", "Empty config file"),
+    ],
+)
+def test_a_bad_configuration_file_gets_one_line(tmp_path: Path, content: str, reason: str) -> None:
+    file = tmp_path / "net.json5"
+    file.write_text(content)
+    with pytest.raises(InputError) as refusal:
         load_config(file)
+    assert re.fullmatch(f"zenoh {re.escape(str(file))}: {reason}", str(refusal.value))
 
 
 @dataclass
