@@ -96,23 +96,24 @@ class Seen:
         return self.freshness.reason
 
 
-def connect(rig: str = "rig", zenoh: Path | str | None = None) -> Client:
+def connect(rig: str = "rig", zenoh: Path | str | None = None, *, waits: bool = True) -> Client:
     """A client of a running system; to be used in a `with` statement.
 
     Args:
         rig: name of the rig.
         zenoh: a Zenoh configuration file that leads to another machine; without it, the system runs
             on this one.
+        waits: for a router that is not there yet, without end; else that is an error within seconds.
 
     Raises:
-        InputError: a bad name, or a configuration that cannot be used.
+        InputError: a bad name, a configuration that cannot be used, or no router.
     """
     try:
         check_name(rig, "rig")
     except ValueError as error:
         raise InputError(str(error)) from error
     config = local_config(rig, "client") if zenoh is None else load_config(Path(zenoh))
-    return Client(Bus(ZenohTransport(config), rig, "client"))
+    return Client(Bus(ZenohTransport(config, waits=waits), rig, "client"))
 
 
 class Client:

@@ -83,7 +83,12 @@ def examine(config: DoctorConfig) -> Iterator[Finding]:
     yield _disk(Path.cwd())
     if config.zenoh is not None:
         yield from certificates(config.zenoh)
-    watches = watch_rigs(config.rig, config.zenoh, _LISTEN_S)
+    try:
+        watches = watch_rigs(config.rig, config.zenoh, _LISTEN_S)
+    except InputError as error:
+        text, _, advice = str(error).partition("; ")
+        yield Finding(ERROR, "running system", text, advice)
+        return
     try:
         running = [watch for watch in watches.values() if watch.health]
         if not running:

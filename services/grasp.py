@@ -60,7 +60,7 @@ def run(config: GraspConfig) -> None:
             approach=config.approach,
         )
 
-    with connect(config.rig, config.zenoh) as client:
+    with connect(config.rig, config.zenoh, waits=False) as client:
         if not config.watch:
             print(_line(ask(client)))
             return

@@ -182,9 +182,6 @@ def _reserved(service: SharedConfig) -> Iterator[str]:
 def _watch(config: RunConfig, console: Console, stack: ExitStack) -> Monitor:
     """Starts the processes and stays until they have ended; raises InputError when one fails."""
     service = config.service
-    stop = list[int]()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: stop.append(number))
     if service.zenoh is None:
         stack.callback(sweep_shared_memory)
         zenoh = local_config(service.rig, "run")
@@ -192,6 +189,10 @@ def _watch(config: RunConfig, console: Console, stack: ExitStack) -> Monitor:
         zenoh = load_config(service.zenoh)
     bus = Bus(ZenohTransport(zenoh), service.rig, "run")
     stack.callback(bus.close)
+    # From here on: who waits for a router is interrupted at once.
+    stop = list[int]()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: stop.append(number))
     monitor = Monitor(bus)
     budget = 0 if service.lockstep else config.restarts
     say = partial(console.print, markup=False, soft_wrap=True)

@@ -11,7 +11,7 @@ from types import FrameType
 
 import zenoh
 
-from services.zenoh_transport import explain, load_config
+from services.zenoh_transport import endpoints, explain, load_config
 from suturetrack.types import InputError
 
 _LONGEST_WAIT_S = 0.25
@@ -46,14 +46,9 @@ def run(config: RouterConfig) -> None:
         signal.signal(number, handler)
     try:
         with zenoh.open(settings):
-            print(f"router: listening on {', '.join(_endpoints(settings))}", flush=True)
+            print(f"router: listening on {endpoints(settings, 'listen')}", flush=True)
             # A signal may reach another thread than this one, which handles it when it wakes up.
             while not stop.wait(_LONGEST_WAIT_S):
                 pass
     except zenoh.ZError as error:
-        raise InputError(explain(error)) from error
-
-
-def _endpoints(settings: zenoh.Config) -> list[str]:
-    endpoints = json.loads(settings.get_json("listen/endpoints"))
-    return endpoints if isinstance(endpoints, list) else endpoints["router"]
+        raise InputError(explain(error, settings)) from error

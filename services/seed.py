@@ -40,7 +40,7 @@ def run(config: SeedConfig) -> None:
     Raises:
         InputError: not exactly one place, no system runs, or there is no thread at that place.
     """
-    with connect(config.rig, config.zenoh) as client:
+    with connect(config.rig, config.zenoh, waits=False) as client:
         try:
             found = client.seed(
                 config.pixel,

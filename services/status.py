@@ -41,12 +41,12 @@ class StatusConfig:
 class RigWatch:
     """What is heard of one rig."""
 
-    def __init__(self, rig: str, zenoh: Path | None):
+    def __init__(self, rig: str, zenoh: Path | None, *, waits: bool = True):
         config = local_config(rig, "status") if zenoh is None else load_config(zenoh)
         self.rig = rig
         self.health: dict[str, tuple[Health, int]] = {}
         """By process: its last heartbeat, and when it arrived by the wall clock, ns."""
-        self.bus = Bus(ZenohTransport(config), rig, "status")
+        self.bus = Bus(ZenohTransport(config, waits=waits), rig, "status")
         self._client = Client(self.bus)
         self._healths = self.bus.every(topics.HEALTH)
 
@@ -142,14 +142,14 @@ def run(config: StatusConfig) -> None:
 def watch_rigs(rig: str | None, zenoh: Path | None, seconds: float) -> dict[str, RigWatch]:
     """What is heard of one rig, or of all on this machine, within some time; to be closed."""
     watches: dict[str, RigWatch] = {}
-    _look(StatusConfig(rig, zenoh), watches, seconds)
+    _look(StatusConfig(rig, zenoh, once=True), watches, seconds)
     return watches
 
 
 def _look(config: StatusConfig, watches: dict[str, RigWatch], seconds: float) -> None:
     for rig in [config.rig] if config.rig else local_rigs():
         if rig not in watches:
-            watches[rig] = RigWatch(rig, config.zenoh)
+            watches[rig] = RigWatch(rig, config.zenoh, waits=not config.once)
     time.sleep(seconds)
     for watch in watches.values():
         watch.listen()

@@ -10,13 +10,16 @@ replaces all of this.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import shutil
 import stat
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import zenoh
 from zenoh.shm import GarbageCollect, ShmProvider, ZShmMut
@@ -42,6 +45,12 @@ _CLOSED = {
 _POOLED = 8
 """Messages of one publisher that fit into its shared memory at the same time."""
 _LARGEST_MESSAGE = 256 << 20
+_ROUTER_MS = 3000
+"""How long a router may take to answer those who do not wait for it."""
+_NOTICE_S = 2.0
+"""After this time those who wait say so."""
+
+log = logging.getLogger("suturetrack")
 
 
 def socket_directory(rig: str) -> Path:
@@ -144,17 +153,28 @@ class ZenohTransport:
         patient: nothing may be lost, for lock-step: wait for slow readers instead of dropping what
             they cannot take, and leave out the shared memory, which is taken back from stalled ones.
         shares: whether images and fields go through shared memory.
+        waits: for a router that is not there yet, without end; else that is an error within seconds.
 
     Raises:
         InputError: the session cannot be opened.
     """
 
-    def __init__(self, config: zenoh.Config, *, patient: bool = False, shares: bool = True):
+    def __init__(
+        self,
+        config: zenoh.Config,
+        *,
+        patient: bool = False,
+        shares: bool = True,
+        waits: bool = True,
+    ):
         zenoh.init_log_from_env_or("error")
+        if not waits and _is_client(config):
+            config.insert_json5("connect/timeout_ms", str(_ROUTER_MS))
         try:
-            self._session = Session(config)
+            with _noticed(config, waits=waits):
+                self._session = Session(config)
         except zenoh.ZError as error:
-            raise InputError(explain(error)) from error
+            raise InputError(explain(error, config)) from error
         self._patient = patient
         self._shares = shares and not patient
         self._publishers: dict[str, zenoh.Publisher] = {}
@@ -331,9 +351,12 @@ def _packet(message: zenoh.Sample | zenoh.Query) -> Packet:
     )
 
 
-def explain(error: zenoh.ZError) -> str:
+def explain(error: zenoh.ZError, config: zenoh.Config) -> str:
     """What went wrong when a session was opened, on one line."""
     text = _first_line(str(error))
+    if "Unable to connect" in text and _is_client(config):
+        where = endpoints(config, "connect")
+        return f"no router answers at {where}; start it with `suturetrack router --zenoh FILE`"
     if "Unable to acquire lock" in text:
         socket = Path(text.partition(" listener on ")[2].partition(" - ")[0])
         return (
@@ -341,6 +364,31 @@ def explain(error: zenoh.ZError) -> str:
             "stop it, or give another --rig"
         )
     return f"zenoh: {text}"
+
+
+def endpoints(config: zenoh.Config, side: Literal["listen", "connect"]) -> str:
+    """Where a session listens, or what it connects to, for people."""
+    given = json.loads(config.get_json(f"{side}/endpoints"))
+    mode = json.loads(config.get_json("mode"))
+    return ", ".join(map(str, given.get(mode, []) if isinstance(given, dict) else given))
+
+
+@contextmanager
+def _noticed(config: zenoh.Config, *, waits: bool) -> Iterator[None]:
+    """Logs whom this waits for, unless the router answers soon."""
+    words = "waiting for the router at %s", endpoints(config, "connect")
+    notice = threading.Timer(_NOTICE_S, log.warning, words)
+    notice.daemon = True
+    if waits and _is_client(config):
+        notice.start()
+    try:
+        yield
+    finally:
+        notice.cancel()
+
+
+def _is_client(config: zenoh.Config) -> bool:
+    return bool(json.loads(config.get_json("mode")) == "client")
 
 
 def _fault(text: str) -> str:

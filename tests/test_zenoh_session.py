@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from services import topics
+from services import cli, topics, zenoh_transport
 from services.bus import Bus
+from services.doctor import ERROR, DoctorConfig, examine
 from services.inbox import Inbox, Stop
 from services.zenoh_transport import ZenohTransport, local_config, remove_sockets
 from suturetrack.types import Stamp
@@ -21,22 +22,13 @@ from suturetrack.types import Stamp
 SOON_S = 30.0
 LISTENER = """
 import sys, threading, time
-from services import topics
+from services import cli, topics, zenoh_transport
 from services.client import connect
 client = connect("test")
 steps = client.bus.every(topics.STEP)
 assert client.bus.wait_for_alive("tracker")
 assert steps.get(20) is not None
 print("heard", flush=True)
-"""
-WAITER = """
-import threading, time
-from services.client import connect
-def tell():
-    while not any(thread.name == "zenoh" for thread in threading.enumerate()):
-        time.sleep(0.01)
-    print("waits", flush=True)
-threading.Thread(target=tell, daemon=True).start()
 """
 ENDS = {
     "": (0, ""),
@@ -90,23 +82,72 @@ def test_a_program_that_closes_nothing_ends_with_its_own_words(talker: None) -> 
             assert "deaf" not in out
 
 
-def test_a_program_is_interrupted_while_it_waits_for_a_router(tmp_path: Path) -> None:
-    router = tmp_path / "nowhere.json5"
-    router.write_text(
+@pytest.fixture
+def no_router(tmp_path: Path) -> Path:
+    """A configuration that leads to a router which is not there."""
+    file = tmp_path / "nowhere.json5"
+    file.write_text(
         '{mode: "client", scouting: {multicast: {enabled: false}},'
         ' connect: {endpoints: ["tcp/127.0.0.1:9"], timeout_ms: -1, exit_on_failure: false}}'
     )
-    with start(f"{WAITER}connect(zenoh={str(router)!r}); print('connected')") as program:
-        assert program.stdout
-        assert program.stdout.readline() == "waits\n"
-        program.send_signal(signal.SIGINT)
-        try:
-            out, err = program.communicate(timeout=SOON_S)
-        finally:
-            program.kill()
+    return file
+
+
+def interrupt(program: subprocess.Popen[str]) -> tuple[str, str]:
+    """What a program says after an interrupt, while it waits for a router and has said so."""
+    assert program.stderr
+    assert program.stderr.readline().endswith("waiting for the router at tcp/127.0.0.1:9\n")
+    program.send_signal(signal.SIGINT)
+    try:
+        return program.communicate(timeout=SOON_S)
+    finally:
+        program.kill()
+
+
+def test_a_program_is_interrupted_while_it_waits_for_a_router(no_router: Path) -> None:
+    code = f"from services.client import connect; connect(zenoh={str(no_router)!r})"
+    with start(f"{code}; print('connected')") as program:
+        out, err = interrupt(program)
     assert program.returncode == -signal.SIGINT
     assert "connected" not in out
     assert err.strip().endswith("KeyboardInterrupt")
+
+
+@pytest.mark.parametrize("verb", ["run --source stage:figure8-107", "tracker", "console"])
+def test_what_goes_on_for_long_waits_for_a_router_and_can_be_interrupted(
+    verb: str, no_router: Path, tmp_path: Path
+) -> None:
+    words = [*verb.split(), "--zenoh", str(no_router)]
+    words += ["--run-dir", str(tmp_path / "run")] if "run" in words else []
+    with start(f"from services import cli; raise SystemExit(cli.call({words!r}))") as program:
+        _, err = interrupt(program)
+    assert program.returncode == 130
+    assert err == ""
+
+
+@pytest.mark.parametrize("verb", ["status --once --rig rig", "seed 3 4", "grasp --fraction 0.5"])
+def test_what_asks_once_does_not_wait_for_a_router(
+    verb: str,
+    no_router: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(zenoh_transport, "_ROUTER_MS", 200)
+    assert cli.call([*verb.split(), "--zenoh", str(no_router)]) == 1
+    assert capsys.readouterr().err == (
+        f"suturetrack {verb.split()[0]}: no router answers at tcp/127.0.0.1:9; "
+        "start it with `suturetrack router --zenoh FILE`\n"
+    )
+
+
+def test_the_doctor_finds_that_there_is_no_router(
+    no_router: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh_transport, "_ROUTER_MS", 200)
+    *local, last = examine(DoctorConfig("rig", no_router))
+    assert "disk" in {finding.subject for finding in local}
+    assert (last.level, last.text) == (ERROR, "no router answers at tcp/127.0.0.1:9")
+    assert last.advice == "start it with `suturetrack router --zenoh FILE`"
 
 
 class Interrupted(Exception):
