@@ -14,6 +14,7 @@ import tyro
 from rich.console import Console
 
 from services.course import Course
+from services.output import opened
 from services.run_folder import RunFolder
 from services.summary import RunSummary, Spread, ThreadSummary, summarize
 from services.tables import new_table, number, report_console
@@ -233,12 +234,9 @@ def _bars(mm: Float64) -> str:
 
 
 def _write(distances: list[Distances], output: Path) -> None:
-    try:
-        with output.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["frame", "thread", "run", "distance_mm"])
-            for d in distances:
-                for frame, mm in zip(d.frames, d.mm.tolist(), strict=True):
-                    writer.writerow([frame, d.thread, d.run, mm if mm == mm else ""])
-    except OSError as error:
-        raise InputError(f"cannot write {output}: {error.strerror}") from error
+    with opened(output) as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["frame", "thread", "run", "distance_mm"])
+        for d in distances:
+            for frame, mm in zip(d.frames, d.mm.tolist(), strict=True):
+                writer.writerow([frame, d.thread, d.run, mm if mm == mm else ""])

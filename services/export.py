@@ -5,16 +5,15 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TextIO
 
 import tyro
 
+from services.output import opened
 from services.run_folder import RecordedState, RunFolder
 from suturetrack.types import InputError
 
@@ -53,7 +52,7 @@ def run(config: ExportConfig) -> None:
     if not states:
         raise InputError(f"{config.run_dir}: no states were recorded; was a thread seeded?")
     write = _write_csv if _format(config) == "csv" else _write_json
-    with _opened(config.output) as file:
+    with opened(config.output) as file:
         write((record(state) for state in states), file)
 
 
@@ -105,20 +104,3 @@ def _flat(line: dict[str, Any]) -> dict[str, Any]:
     lists = {"knots": line["knots"], "control_points": points}
     flat = line | {name: " ".join(map(repr, numbers)) for name, numbers in lists.items()}
     return flat | {f"energy_{name}": value for name, value in flat.pop("energy").items()}
-
-
-@contextmanager
-def _opened(output: Path | None) -> Iterator[TextIO]:
-    """The output; a file appears under its name only when it is whole."""
-    if output is None:
-        yield sys.stdout
-        return
-    unfinished = output.with_name(f".{output.name}.{os.getpid()}")
-    try:
-        with unfinished.open("w", newline="", encoding="utf-8") as file:
-            yield file
-        unfinished.replace(output)
-    except OSError as error:
-        raise InputError(f"cannot write {output}: {error.strerror}") from error
-    finally:
-        unfinished.unlink(missing_ok=True)

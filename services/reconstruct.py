@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,6 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from services.output import opened
 from services.sources.exposure import exposure_fault
 from services.sources.footage import halves, read_image
 from services.sources.rig import check_size, open_rig
@@ -83,7 +83,8 @@ def run(config: ReconstructConfig) -> None:
         found = initialize(segmenter.step(frame), rig, seed, config.initialization)
     except InitializationError as error:
         raise InputError(error.reason) from error
-    _write(config.output, record(found))
+    with opened(config.output) as file:
+        file.write(json.dumps(record(found), indent=1, allow_nan=False) + "\n")
 
 
 def _pixel(
@@ -142,15 +143,3 @@ def _check(left: Image, right: Image, rig: StereoRig) -> None:
 
 def _size(image: Image) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
-
-
-def _write(path: Path, value: dict[str, Any]) -> None:
-    """Writes the file whole or not at all."""
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        unfinished.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        unfinished.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
