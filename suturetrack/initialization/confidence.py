@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from suturetrack import nurbs
@@ -14,9 +13,8 @@ from suturetrack.initialization.model import PlacedDoubts, remaining
 from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import Ridges
 from suturetrack.metrics import coverage, polyline_length
-from suturetrack.types import Float64, Nurbs
+from suturetrack.types import Float64, Int64, Nurbs
 
-Int64 = NDArray[np.int64]
 _AGREED = 0.95
 """Share of the thread from which both views are said to agree."""
 _DISAGREED = 0.5

@@ -6,15 +6,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.kernels import search
-from suturetrack.types import Bool, Float64
-
-Int64 = NDArray[np.int64]
+from suturetrack.types import Bool, Float64, Int64
 
 _CLEAR = 2
 """Points at the very end of a segment that the other ridges of a junction have drawn aside."""

@@ -7,15 +7,12 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 from scipy.spatial import cKDTree
 
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.kernels import crest, search
-from suturetrack.types import Float32, Float64
-
-Int64 = NDArray[np.int64]
+from suturetrack.types import Float32, Float64, Int64
 
 ARM = 14
 """Points of a segment that tell where it is heading."""

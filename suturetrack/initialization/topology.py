@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from suturetrack.initialization.depth import Depth
@@ -17,9 +16,7 @@ from suturetrack.initialization.paths import is_ring, other_end, ring_from
 from suturetrack.initialization.pricing import FREE_END, Merge, price_merges
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.initialization.strands import REACH, Strands
-from suturetrack.types import Float64
-
-Int64 = NDArray[np.int64]
+from suturetrack.types import Float64, Int64
 
 _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from suturetrack.types import Bool, Float32
-
-Int64 = NDArray[np.int64]
+from suturetrack.types import Bool, Float32, Int64
 
 
 @numba.njit(cache=True, nogil=True)

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from suturetrack.types import Float32, Float64
-
-Int64 = NDArray[np.int64]
+from suturetrack.types import Float32, Float64, Int64
 
 UNSEEN = 0.5
 """Cost of a place that lies outside the right image."""

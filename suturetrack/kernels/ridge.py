@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from suturetrack.types import Float32, Image
+from suturetrack.types import Float32, Image, Int64
 
 _fast = {"fastmath": {"contract", "nnan", "ninf", "nsz", "arcp"}, "error_model": "numpy"}
 # Without licence to mix up +0 and -0.
@@ -49,7 +48,7 @@ def mix_channels(blue: Image, green: Image, red: Image, weights: Float32, plane:
 
 
 @cache
-def taps_of(sigmas: tuple[float, ...]) -> tuple[Float32, NDArray[np.int64]]:
+def taps_of(sigmas: tuple[float, ...]) -> tuple[Float32, Int64]:
     """(k, 3, r + 1) `gaussian_taps` of k scales, filled up with zeros, and (k,) their own radii."""
     every = [gaussian_taps(sigma) for sigma in sigmas]
     radii = np.array([taps.shape[1] - 1 for taps in every])
@@ -61,7 +60,7 @@ def taps_of(sigmas: tuple[float, ...]) -> tuple[Float32, NDArray[np.int64]]:
 def ridge_field(
     plane: Float32,
     taps: Float32,
-    radii: NDArray[np.int64],
+    radii: Int64,
     shape: tuple[float, float],
     signs: tuple[float, float],
     kernel: Float32,

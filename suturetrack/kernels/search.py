@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from suturetrack.types import Bool, Float32, Float64
-
-Int64 = NDArray[np.int64]
+from suturetrack.types import Bool, Float32, Float64, Int64
 
 # A strand claims the ridge so far to its sides; two that are nearer than this make one ridge.
 _CLAIM_PX, APART_PX = 4.0, 2.0

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from suturetrack.types import Float64
-
-Int64 = NDArray[np.int64]
+from suturetrack.types import Float64, Int64
 
 DEGREE = 3
 ORDER = DEGREE + 1

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.kernels.search import Int64
 from suturetrack.tracking.sampling import Samples, View, views_at
-from suturetrack.types import Bool, Float64, Nurbs
+from suturetrack.types import Bool, Float64, Int64, Nurbs
 
 # A curve lies on a part of itself that is so near and so parallel, and so far away along it; so many
 # samples in a row may lie elsewhere. What comes back at once has folded.

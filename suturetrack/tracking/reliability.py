@@ -9,12 +9,11 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
-from suturetrack.kernels.search import Int64
 from suturetrack.nurbs import part
 from suturetrack.tracking.gauss_newton import Fit
 from suturetrack.tracking.sampling import View, values_at, views_at
 from suturetrack.tracking.strands import SAME_STRAND_PX, Neighbours, Strand
-from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField, Status
+from suturetrack.types import Bool, Float32, Float64, Int64, Nurbs, RidgeField, Status
 
 RELIABILITY_SAMPLES = 64
 _EVENLY = np.linspace(0, 1, RELIABILITY_SAMPLES)

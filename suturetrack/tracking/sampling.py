@@ -8,7 +8,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import spline
-from suturetrack.types import Bool, Float64, Nurbs
+from suturetrack.types import Bool, Float64, Int64, Nurbs
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +19,7 @@ class Samples:
     """(k,) sorted parameters."""
     share: Float64
     """(k,) length of the piece of [0, 1] that each stands for."""
-    first: spline.Int64
+    first: Int64
     """(k,) first of the four control points that move the sample."""
     table: Float64
     """(3, k, 4) basis values, first and second derivatives."""

@@ -6,16 +6,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.metrics import polyline_length
 from suturetrack.tracking.sampling import View, views_at
 from suturetrack.tracking.strands import Neighbours
-from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField
-
-UInt8 = NDArray[np.uint8]
+from suturetrack.types import Bool, Float32, Float64, Image, Nurbs, RidgeField
 
 _PLACES = 96
 # What has moved is where no ridge was at some time in the last seconds, looked at so often.
@@ -49,7 +46,7 @@ class Strangers:
     """Whether a ridge that has moved branches off the curve, in both views, at two looks in a row."""
     _suspected: bool = False
     """The same at the last look alone: a curve may be off in a single field that is blurred."""
-    _past: tuple[tuple[int, tuple[UInt8, UInt8]], ...] = ()
+    _past: tuple[tuple[int, tuple[Image, Image]], ...] = ()
     """Capture times and where there were ridges, left and right, a bit for each pixel."""
 
     def of_another(self) -> Strangers:
@@ -100,7 +97,7 @@ class Strangers:
         return Strangers(is_found, suspected, (*past, (now, (ridges[0], ridges[1]))))
 
 
-def _packed(power: Float32) -> UInt8:
+def _packed(power: Float32) -> Image:
     ridges = cv2.dilate((power > _NOTHING**2).astype(np.uint8), np.ones((3, 3), np.uint8))
     return np.packbits(ridges, axis=1)
 
@@ -122,7 +119,7 @@ def _half_width(image: Float32, view: View, level: float) -> float:
 
 
 def _branches(
-    power: Float32, stayed: UInt8, view: View, seen: Bool, others: Float64, own_px: float
+    power: Float32, stayed: Image, view: View, seen: Bool, others: Float64, own_px: float
 ) -> Bool:
     """(k,) places of the curve near which ridges that have moved branch off it to one side.
 
