@@ -1,4 +1,4 @@
-"""How far a curve is from the truth: distances, length, ends, coverage."""
+"""Polylines, and how far a curve is from the truth: distances, length, ends, coverage."""
 
 from __future__ import annotations
 
@@ -49,6 +49,23 @@ def curve_error(estimate: Float64, truth: Float64) -> CurveError:
 def polyline_length(points: Float64) -> float:
     """Length of the polyline through (k, dim) points."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def arc_lengths(points: Float64) -> Float64:
+    """(k,) length of the polyline through (k, dim) points up to each of them."""
+    return np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+
+
+def polyline_at(points: Float64, lengths: Float64) -> Float64:
+    """(m, dim) places on the polyline through (k, dim) points, so far from its start each."""
+    along = arc_lengths(points)
+    return np.stack([np.interp(lengths, along, column) for column in points.T], axis=1)
+
+
+def polyline_tangents(points: Float64) -> Float64:
+    """(k, dim) unit tangents at evenly spaced points."""
+    steps = np.gradient(points, axis=0)
+    return steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def polyline_distances(points: Float64, polyline: Float64) -> Float64:
@@ -120,7 +137,7 @@ def knot_shift(estimate: Float64, truth: Float64, touching: float, longest: floa
         longest: length of thread within which it does so in a tight knot; what is less than three
             times `touching` apart along the thread does not count.
     """
-    travelled = _travelled(truth)
+    travelled = arc_lengths(truth)
     apart = travelled - travelled[:, None]
     one, other = np.nonzero((apart > 3 * touching) & (apart < longest))
     touch = np.linalg.norm(truth[one] - truth[other], axis=1) < touching
@@ -129,7 +146,7 @@ def knot_shift(estimate: Float64, truth: Float64, touching: float, longest: floa
     knot = [int(one[touch].min()), int(other[touch].max())]
     free = np.array([travelled[knot[0]], travelled[-1] - travelled[knot[1]]])
     places = cKDTree(estimate).query(truth[knot])[1]
-    along = _travelled(estimate)[places]
+    along = arc_lengths(estimate)[places]
     length = polyline_length(estimate)
     ways = np.abs(along - [0, length]), np.abs(along - [length, 0])
     return float(min(np.abs(way - free).max() for way in ways))
@@ -137,9 +154,7 @@ def knot_shift(estimate: Float64, truth: Float64, touching: float, longest: floa
 
 def resample(points: Float64, count: int) -> Float64:
     """(count, dim) points evenly spaced along the polyline through (k, dim) points."""
-    travelled = _travelled(points)
-    samples = np.linspace(0, travelled[-1], count)
-    return np.stack([np.interp(samples, travelled, column) for column in points.T], axis=1)
+    return polyline_at(points, np.linspace(0, arc_lengths(points)[-1], count))
 
 
 def _warped(distances: Float64) -> Float64:
@@ -179,7 +194,7 @@ def physical_limit(
     Returns:
         Root mean square distance across the thread, calibration's unit.
     """
-    travelled = _travelled(rig.project(points)[0])
+    travelled = arc_lengths(rig.project(points)[0])
     samples = np.linspace(0, travelled[-1], max(int(travelled[-1]), 16))
     points = np.stack([np.interp(samples, travelled, column) for column in points.T], axis=1)
     s = samples / samples[-1]
@@ -191,22 +206,13 @@ def physical_limit(
     energy = float(np.einsum("id,ij,jd", control_points, bending, control_points))
     information = np.kron(bending, np.eye(3)) * (control_points.size / energy)
     for pixels, jacobian in zip(rig.project(points), rig.projection_jacobian(points), strict=True):
-        tangent = _unit(np.gradient(pixels, axis=0))
+        tangent = polyline_tangents(pixels)
         normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
         row = np.einsum("kd,kdi->ki", normal, jacobian) / noise_px
         rows = (a[:, :, None] * row[:, None, :]).reshape(len(a), -1)
         information += rows.T @ rows
     covariance = np.linalg.pinv(information, hermitian=True).reshape(count, 3, count, 3)
     of_points = np.einsum("ki,kj,iajb->kab", a, a, covariance, optimize=True)
-    tangent = _unit(np.gradient(points, axis=0))
+    tangent = polyline_tangents(points)
     along = np.einsum("ka,kab,kb->k", tangent, of_points, tangent)
     return float(np.sqrt(np.mean(np.trace(of_points, axis1=1, axis2=2) - along)))
-
-
-def _travelled(points: Float64) -> Float64:
-    return np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-
-
-def _unit(vectors: Float64) -> Float64:
-    norm = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.maximum(norm, np.finfo(float).tiny)

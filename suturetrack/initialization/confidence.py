@@ -12,7 +12,7 @@ from suturetrack.initialization.growth import Chain
 from suturetrack.initialization.model import PlacedDoubts, remaining
 from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import Ridges
-from suturetrack.metrics import coverage, polyline_length
+from suturetrack.metrics import arc_lengths, coverage, polyline_at, polyline_length
 from suturetrack.types import Float64, Int64, Nurbs
 
 _AGREED = 0.95
@@ -227,9 +227,7 @@ def _is_all_ridge(place: Float64, line: Float64, near: Int64, ridges: Ridges) ->
 
 
 def _bends_sharply(passing: Float64) -> bool:
-    travelled = np.r_[0, np.cumsum(np.linalg.norm(np.diff(passing, axis=0), axis=1))]
-    at = np.arange(0.0, travelled[-1], 1.0)
-    even = np.c_[[np.interp(at, travelled, c) for c in passing.T]].T
+    even = polyline_at(passing, np.arange(0.0, arc_lengths(passing)[-1], 1.0))
     steps = even[_BEND_REACH:] - even[:-_BEND_REACH]
     steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
     return bool(((steps[_BEND_REACH:] * steps[:-_BEND_REACH]).sum(1) < _SHARP_COSINE).any())

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from suturetrack.kernels import search
+from suturetrack.metrics import polyline_tangents
 from suturetrack.types import Float32, Float64
 
 _OFFSETS = np.arange(-4.0, 4.01, 0.5)
@@ -65,8 +66,7 @@ class Crest:
 
 def find_crest(view: View, pixels: Float64) -> Crest:
     """Looks for the crest across (k, 2) evenly spaced pixels of a projected curve."""
-    tangents = np.gradient(pixels, axis=0)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+    tangents = polyline_tangents(pixels)
     profiles = search.normal_profiles(view.field, pixels, tangents, _OFFSETS, 0.0)
     expected = profiles * np.exp(-0.5 * (_OFFSETS / _NEAR_PX) ** 2)
     peak = np.argmax(expected, axis=1)

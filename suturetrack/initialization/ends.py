@@ -8,6 +8,7 @@ import numpy as np
 
 from suturetrack.initialization.crest import moments, single
 from suturetrack.kernels import search
+from suturetrack.metrics import arc_lengths, polyline_at, polyline_tangents
 from suturetrack.types import Float32, Float64
 
 _INSIDE_PX = 14.0
@@ -41,14 +42,12 @@ class EndReading:
 
 def read_end(field: Float32, pixels: Float64) -> EndReading:
     """Reads the end of a thread at the start of (k, 2) pixels that run inwards, about 1 px apart."""
-    travelled = np.r_[0, np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1))]
+    travelled = arc_lengths(pixels)
     outward = pixels[0] - pixels[np.searchsorted(travelled, min(4.0, travelled[-1] / 2))]
     outward /= max(float(np.linalg.norm(outward)), 1e-9)
     x = np.arange(-min(_INSIDE_PX, travelled[-1]), _OUTSIDE_PX, _STEP_PX)
-    inside = np.c_[[np.interp(-x, travelled, c) for c in pixels.T]].T
-    places = np.where(x[:, None] <= 0, inside, pixels[0] + x[:, None] * outward)
-    tangents = np.gradient(places, axis=0)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+    places = np.where(x[:, None] <= 0, polyline_at(pixels, -x), pixels[0] + x[:, None] * outward)
+    tangents = polyline_tangents(places)
     response = search.normal_profiles(field, places, tangents, _BESIDE, 0.0).max(1)
     level = _END_LEVEL * float(np.median(response[x < -4]))
     run = int(_STAYS_PX / _STEP_PX)
@@ -109,8 +108,7 @@ def move_end(pixels: Float64, offset_px: float) -> Float64:
         pixels: (k, dim) of which the first two columns are pixels about 1 px apart.
         offset_px: how far; inwards where negative.
     """
-    along = np.linalg.norm(np.diff(pixels[:, :2], axis=0), axis=1)
-    travelled = np.r_[0, np.cumsum(along)]
+    travelled = arc_lengths(pixels[:, :2])
     if offset_px <= 0:
         first = np.array([[np.interp(-offset_px, travelled, c) for c in pixels.T]])
         return np.r_[first, pixels[travelled > -offset_px + 0.5]]

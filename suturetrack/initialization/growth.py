@@ -15,6 +15,7 @@ from suturetrack.initialization.paths import follow
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
 from suturetrack.kernels import growth as kernel
+from suturetrack.metrics import arc_lengths, polyline_at
 from suturetrack.types import Bool, Float32, Float64
 
 _FAINT = 0.4
@@ -205,8 +206,7 @@ def _join(pieces: list[Float64]) -> Chain:
 
 def resample(chain: Chain) -> Chain:
     """The chain at points one pixel apart."""
-    travelled = np.r_[0, np.cumsum(np.linalg.norm(np.diff(chain.pixels, axis=0), axis=1))]
-    at = np.linspace(0, travelled[-1], max(round(travelled[-1]), 1) + 1)
-    pixels = np.c_[[np.interp(at, travelled, c) for c in chain.pixels.T]].T
-    nearest = np.clip(np.searchsorted(travelled, at), 0, len(travelled) - 1)
-    return Chain(pixels, chain.seen[nearest])
+    along = arc_lengths(chain.pixels)
+    at = np.linspace(0, along[-1], max(round(along[-1]), 1) + 1)
+    nearest = np.clip(np.searchsorted(along, at), 0, len(along) - 1)
+    return Chain(polyline_at(chain.pixels, at), chain.seen[nearest])

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.kernels import crest, search
+from suturetrack.metrics import polyline_tangents
 from suturetrack.types import Float32, Float64, Int64
 
 ARM = 14
@@ -94,8 +95,7 @@ def thread_scale(ridges: Ridges, seed: Float64) -> int:
     nearest = int(np.argmin([d.min() for d in distances]))
     at = int(np.argmin(distances[nearest]))
     segment = segments[nearest][max(at - _WIDTH_REACH, 0) : at + _WIDTH_REACH]
-    tangents = np.gradient(segment, axis=0)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+    tangents = polyline_tangents(segment)
     profiles = search.normal_profiles(ridges.field, segment, tangents, _ACROSS, 0.0)
     profile = np.median(profiles, axis=0)
     middle = len(_ACROSS) // 2

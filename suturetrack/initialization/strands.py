@@ -10,6 +10,7 @@ from scipy.linalg import cho_solve, cholesky
 
 from suturetrack.initialization.depth import Depth, Disparities
 from suturetrack.initialization.pricing import Merge
+from suturetrack.metrics import arc_lengths
 from suturetrack.types import Float64
 
 REACH = 60
@@ -143,21 +144,17 @@ def _bend(one: Float64, other: Float64) -> float:
     one, other = (
         a[min(_SKIPPED, len(a) // 4) : _SHAPE_POINTS : _EVERY] for a in (one[:REACH], other[:REACH])
     )
-    t = _travelled(np.r_[one[::-1], other])
+    t = arc_lengths(np.r_[one[::-1], other])
     variances = [np.full(len(a), _SHAPE_NOISE_PX**2) for a in (one[::-1], other)]
     return _excess(t, (one[::-1], other), variances, _curving)
 
 
 def _step(one: Disparities, other: Disparities) -> float:
     """How much more the disparity of two arms has to change as one strand than as two."""
-    t = _travelled(np.r_[one.pixels[::-1], other.pixels])
+    t = arc_lengths(np.r_[one.pixels[::-1], other.pixels])
     values = one.value[::-1, None], other.value[:, None]
     variances = [one.variance[::-1], other.variance]
     return max(_excess(t, values, variances, _sloping), 0.0)
-
-
-def _travelled(pixels: Float64) -> Float64:
-    return np.r_[0, np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1))]
 
 
 def _excess(

@@ -22,6 +22,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search, spline
+from suturetrack.metrics import arc_lengths
 from suturetrack.nurbs import curve_from, evenly_spaced
 from suturetrack.tracking.config import PaperConfig
 from suturetrack.tracking.sampling import Samples, View, views
@@ -142,7 +143,7 @@ def _along_end(view: View, end: int, x: Float64) -> tuple[Float64, Float64]:
     """(k, 2) pixels and unit tangents x px outward from an end: on the curve, then straight on."""
     order = slice(None) if end == 0 else slice(None, None, -1)
     pixels, tangents = view.pixels[order], view.tangents[order]
-    inward = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1))]
+    inward = arc_lengths(pixels)
     on_curve = [np.interp(-x, inward, column) for column in np.c_[pixels, tangents].T]
     places, directions = np.stack(on_curve[:2], axis=1), np.stack(on_curve[2:], axis=1)
     outward = tangents[0] if end else -tangents[0]

@@ -9,6 +9,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
+from suturetrack.metrics import arc_lengths
 from suturetrack.nurbs import part
 from suturetrack.tracking.gauss_newton import Fit
 from suturetrack.tracking.sampling import View, values_at, views_at
@@ -232,7 +233,7 @@ def _from_held(seen: Bool, places: Float64) -> Float64:
     """(k,) way along (k, 2) places to the nearer of the long seen stretches around, px; infinite where
     there is none on one side."""
     held = search.solid(seen, np.ones(len(seen)), round(_HOLD * len(seen)))
-    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
+    along = arc_lengths(places)
     before = np.maximum.accumulate(np.where(held, along, -np.inf))
     after = np.minimum.accumulate(np.where(held, along, np.inf)[::-1])[::-1]
     is_between = np.isfinite(before) & np.isfinite(after)
