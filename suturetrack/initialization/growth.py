@@ -15,8 +15,8 @@ from suturetrack.initialization.paths import follow
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
 from suturetrack.kernels import growth as kernel
-from suturetrack.metrics import arc_lengths, polyline_at
-from suturetrack.types import Bool, Float32, Float64
+from suturetrack.metrics import arc_lengths, resample
+from suturetrack.types import Float32, Float64
 
 _FAINT = 0.4
 """Strength, against the rest of the thread, below which a last segment is no part of it."""
@@ -38,8 +38,6 @@ class Chain:
 
     pixels: Float64
     """(k, 2) about one pixel apart."""
-    seen: Bool
-    """(k,) False where a gap was bridged."""
     doubts: tuple[Doubt, ...] = ()
     """Where the thread may run another way."""
 
@@ -95,7 +93,7 @@ def follow_thread(
     ridges = replace(ridges, segments=merged.segments)
     entries = _without_faint_ends(ridges, follow(origin, merged.partner), origin)
     pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
-    chain = replace(_join(pieces), doubts=tuple(doubts(merged, entries, ridges)))
+    chain = Chain(_join(pieces), tuple(doubts(merged, entries, ridges)))
     return Thread(ridges, entries, origin, chain)
 
 
@@ -113,7 +111,7 @@ def without_faint_tails(thread: Thread, place: Float64) -> Thread:
     left = [d for d in chain.doubts if np.linalg.norm(pixels - d[0], axis=1).min() < _WINDOW]
     cut = [end for end, at in ((0, start), (-1, len(strength) - stop)) if at > 0]
     left += [(pixels[end], FADES, _FAINTER) for end in cut]
-    return replace(thread, chain=Chain(pixels, chain.seen[start:stop], tuple(left)))
+    return replace(thread, chain=Chain(pixels, tuple(left)))
 
 
 def _falls_at(strength: Float64, first: int) -> int:
@@ -193,20 +191,12 @@ def _is_reached(segment: Float64, cost: Float32) -> bool:
     return bool(np.isfinite(cost[v, u]).mean() > 0.5)
 
 
-def _join(pieces: list[Float64]) -> Chain:
-    """One chain through all pieces, straight over the gaps between them, smoothed a little."""
-    points, seen = [pieces[0]], [np.ones(len(pieces[0]), bool)]
+def _join(pieces: list[Float64]) -> Float64:
+    """(k, 2) pixels through all pieces, straight over the gaps between them, one pixel apart."""
+    points = [pieces[0]]
     for a, b in pairwise(pieces):
         count = int(np.linalg.norm(b[0] - a[-1]))
         share = np.arange(1, count)[:, None] / max(count, 1)
         points += [a[-1] + share * (b[0] - a[-1]), b]
-        seen += [np.zeros(len(share), bool), np.ones(len(b), bool)]
-    return resample(Chain(np.concatenate(points), np.concatenate(seen)))
-
-
-def resample(chain: Chain) -> Chain:
-    """The chain at points one pixel apart."""
-    along = arc_lengths(chain.pixels)
-    at = np.linspace(0, along[-1], max(round(along[-1]), 1) + 1)
-    nearest = np.clip(np.searchsorted(along, at), 0, len(along) - 1)
-    return Chain(polyline_at(chain.pixels, at), chain.seen[nearest])
+    line = np.concatenate(points)
+    return resample(line, max(round(arc_lengths(line)[-1]), 1) + 1)

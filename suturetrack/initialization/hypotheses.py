@@ -55,7 +55,7 @@ class Hypothesis:
     @property
     def chains(self) -> tuple[Chain, Chain]:
         """The thread as each view by itself has it."""
-        nothing = Chain(np.empty((0, 2)), np.empty(0, bool))
+        nothing = Chain(np.empty((0, 2)))
         return self.left.chain, nothing if self.right is None else self.right.chain
 
 
