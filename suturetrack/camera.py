@@ -129,6 +129,11 @@ class StereoRig:
         """Distance of the cameras, calibration's unit."""
         return float(-self.right.projection[0, 3] / self.right.projection[0, 0])
 
+    @property
+    def disparity_at_infinity(self) -> float:
+        """u_left - u_right of points at infinity, px."""
+        return float(self.left.projection[0, 2] - self.right.projection[0, 2])
+
     def reduced(self, scale: int) -> StereoRig:
         """The rig for rectified images of which only every `scale`-th pixel is kept, from the first."""
         shrink = np.diag([1 / scale, 1 / scale, 1.0])

@@ -252,7 +252,7 @@ def _on_row(
     field: RidgeField, rig: StereoRig, right: Float64, config: InitializationConfig
 ) -> list[Float64]:
     """Where ridges of the left view cross the row of a right pixel, nearest disparity first."""
-    farthest = right[0] + rig.left.projection[0, 2] - rig.right.projection[0, 2]
+    farthest = right[0] + rig.disparity_at_infinity
     places = []
     for segment in find_ridges(field.left, config).segments:
         ahead = segment[segment[:, 0] > farthest]

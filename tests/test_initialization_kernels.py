@@ -59,11 +59,10 @@ def test_matching_costs_are_one_less_the_response(first: float, step: float, cou
 @pytest.mark.parametrize("seed", range(5))
 def test_the_cheapest_path_is_the_cheapest_of_all(seed: int) -> None:
     costs = np.random.default_rng(seed).uniform(0, 1, (6, 4)).astype(np.float32)
-    states, total = matching.cheapest_path(costs, 1, 0.2)
+    states = matching.cheapest_path(costs, 1, 0.2)
     paths = itertools.product(range(4), repeat=6)
     possible = (p for p in paths if all(abs(a - b) <= 1 for a, b in itertools.pairwise(p)))
     best = min(reference.path_cost(costs, p, 0.2) for p in possible)
-    assert total == pytest.approx(best, abs=1e-5)
     assert reference.path_cost(costs, tuple(states), 0.2) == pytest.approx(best, abs=1e-5)
 
 

@@ -110,9 +110,8 @@ def _initialize(
     if origin is None:
         reason = _nothing_there(scale * candidates, scale * pixel, config)
         raise InitializationError(reason, candidates)
-    nearest = float(rig.left.projection[0, 2] - rig.right.projection[0, 2])
     thread = follow_thread(left, origin, config)
-    rows = row_offset(thread.chain, field.left, field.right, nearest)
+    rows = row_offset(thread.chain.pixels, field.left, field.right, rig.disparity_at_infinity)
     found: Initialization | None = None
     try:
         found = _reconstruct(field, left, thread, rig, pixel, config, scale)
@@ -152,10 +151,9 @@ def _reconstruct(
     scale: int,
 ) -> Initialization:
     """The curve of a thread of the left view."""
-    nearest = float(rig.left.projection[0, 2] - rig.right.projection[0, 2])
     candidates = nearest_segment(left, pixel, config.snap_px)[1]
     ridges = left, find_ridges(field.right, config)
-    found = find_thread(field, ridges, thread, pixel, nearest, config)
+    found = find_thread(field, ridges, thread, pixel, rig.disparity_at_infinity, config)
     pixels = found.pixels
     step = max(1, round(config.step_px))
     marks = pixels[::step].reshape(-1, 2, 2)
@@ -164,7 +162,9 @@ def _reconstruct(
         reason = f"the ridge at the seed is only {scale * len(pixels)} px long"
         raise InitializationError(reason, candidates, growth)
     if not _is_matched(found.matched):
-        swapped = match(found.left.chain, field.left, field.right, nearest, -1)
+        swapped = match(
+            found.left.chain.pixels, field.left, field.right, rig.disparity_at_infinity, -1
+        )
         raise InitializationError(_no_match(swapped), candidates, growth)
     pixels = _trim(pixels, left)
     s = image_parameters(pixels[:, :2], pixels[:, 2:])

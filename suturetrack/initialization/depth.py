@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from suturetrack.initialization.crest import moments
+from suturetrack.initialization.matching import disparities
 from suturetrack.initialization.segments import chain_tangents
-from suturetrack.kernels import matching as kernel
 from suturetrack.kernels import search
 from suturetrack.types import Float32, Float64
 
@@ -16,7 +17,6 @@ _PENALTY = 0.8
 """Cost of a state's change, against 1 for a sample without any ridge."""
 _BEYOND_PX = 25.0
 """How far disparities may lie from those of the thread, px."""
-_LEAST_LEVEL = 0.1
 _LEAST_RESPONSE = 0.45
 _LEAST_SLOPE = 0.2
 """Sine of the angle to the epipolar lines from which a point has a disparity."""
@@ -63,14 +63,11 @@ class Depth:
         if len(arm) < 2 * _LEAST_POINTS:
             return None
         tangents = chain_tangents(arm)
-        level = max(float(np.median(search.responses(self.own, arm, tangents))), _LEAST_LEVEL)
-        costs = kernel.matching_costs(
-            self.other, arm, tangents, self.lowest, _STATE_PX, self.states, level
+        coarse, response = disparities(
+            arm, self.own, self.other, self.lowest, _STATE_PX, self.states, _PENALTY
         )
-        states, _ = kernel.cheapest_path(costs, 1, _PENALTY)
-        coarse = self.lowest + _STATE_PX * states
         slope = abs(tangents[:, 1])
-        told = (costs[np.arange(len(arm)), states] < 1 - _LEAST_RESPONSE) & (slope > _LEAST_SLOPE)
+        told = (response > _LEAST_RESPONSE) & (slope > _LEAST_SLOPE)
         told[: min(_SKIPPED, len(arm) // 4)] = False
         chosen = np.flatnonzero(told)[::_EVERY]
         if len(chosen) < _LEAST_POINTS:
@@ -85,6 +82,4 @@ class Depth:
         places = pixels[:, None] - (coarse[:, None] + _FINE)[..., None] * np.array([1.0, 0.0])
         repeated = np.repeat(tangents, len(_FINE), axis=0)
         profiles = search.responses(self.other, places.reshape(-1, 2), repeated)
-        profiles = profiles.reshape(-1, len(_FINE))
-        weights = np.maximum(profiles - profiles.min(1, keepdims=True), 0) ** 2
-        return coarse + (weights * _FINE).sum(1) / np.maximum(weights.sum(1), 1e-9)
+        return coarse + moments(profiles.reshape(-1, len(_FINE)), _FINE)[0]

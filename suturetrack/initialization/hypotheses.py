@@ -64,7 +64,7 @@ def find_thread(
     ridges: tuple[Ridges, Ridges],
     left: Thread,
     seed: Float64,
-    nearest: float,
+    at_infinity: float,
     config: InitializationConfig,
 ) -> Hypothesis:
     """A thread of the left view as the view shows it that shows it better.
@@ -74,16 +74,16 @@ def find_thread(
         ridges: of the left and the right view.
         left: the thread as the left view by itself has it, whatever its depth.
         seed: (2,) left pixel on it.
-        nearest: disparity of points at infinity, px.
+        at_infinity: disparity of points at infinity, px.
         config: settings.
     """
-    matched = match(left.chain, field.left, field.right, nearest, 1)
+    matched = match(left.chain.pixels, field.left, field.right, at_infinity, 1)
     apart = (left.chain.pixels - matched.pixels)[matched.inside, 0]
     if len(apart):
         depth = Depth.around(apart, field.left, field.right)
         left = follow_thread(ridges[0], left.origin, config, depth)
         left = without_faint_tails(left, seed)
-        matched = match(left.chain, field.left, field.right, nearest, 1)
+        matched = match(left.chain.pixels, field.left, field.right, at_infinity, 1)
     there = matched.pixels[_closest(left.chain.pixels, seed)]
     partner, _ = nearest_segment(ridges[1], there, np.inf)
     if partner is None:
@@ -98,7 +98,7 @@ def find_thread(
     first = Hypothesis(left, right, matched)
     if _agreement(matched.pixels[matched.inside], right.chain.pixels) >= AGREED:
         return first
-    mirrored = match(right.chain, field.right, field.left, -nearest, -1)
+    mirrored = match(right.chain.pixels, field.right, field.left, -at_infinity, -1)
     through_seed = np.linalg.norm(mirrored.pixels - seed, axis=1).min() <= config.snap_px
     if through_seed and _worth(right, mirrored, matched) > _worth(left, matched, mirrored):
         return Hypothesis(left, right, mirrored, by_right=True)

@@ -74,8 +74,8 @@ def _respond(
 
 
 @numba.njit(cache=True, nogil=True)
-def cheapest_path(costs: Float32, reach: int, penalty: float) -> tuple[Int64, float]:
-    """(k,) states of the cheapest path through (k, m) costs, and its total cost.
+def cheapest_path(costs: Float32, reach: int, penalty: float) -> Int64:
+    """(k,) states of the cheapest path through (k, m) costs.
 
     A change of the state by i costs i * penalty; it may be `reach` at most.
     """
@@ -96,4 +96,4 @@ def cheapest_path(costs: Float32, reach: int, penalty: float) -> tuple[Int64, fl
     states[-1] = np.argmin(total)
     for k in range(samples - 1, 0, -1):
         states[k - 1] = states[k] + came[k, states[k]]
-    return states, float(total.min())
+    return states
