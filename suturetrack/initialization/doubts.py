@@ -1,4 +1,4 @@
-"""What is doubtful about a thread of merged segments: where it crosses, bends, ends, or is joined."""
+"""What is doubtful about a thread of joints segments: where it crosses, bends, ends, or is joined."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from suturetrack.initialization.paths import follow
-from suturetrack.initialization.pricing import FREE_END, TOUCHING_PX
+from suturetrack.initialization.joints import Joints, inward
+from suturetrack.initialization.pricing import FREE_END, HIGHEST, TOUCHING_PX
 from suturetrack.initialization.segments import ARM, Ridges, chain_tangents
 from suturetrack.initialization.strands import ENERGY
-from suturetrack.initialization.topology import Merged, swap, within_reach
 from suturetrack.types import Float64
 
 Doubt = tuple[Float64, str, float]
@@ -52,68 +51,69 @@ _SIDE = 40
 """Points of the thread on each side of a place whose strength counts there."""
 
 
-def doubts(merged: Merged, entries: list[int], ridges: Ridges) -> list[Doubt]:
+def doubts(joints: Joints, entries: list[int], ridges: Ridges) -> list[Doubt]:
     """What is doubtful about the thread that enters its segments at `entries`; `ridges` are those that
-    were merged."""
+    were joined."""
     return [
-        (merged.segments[end // 2][-(end % 2)], why, rest)
+        (inward(joints.segments, end)[0], why, rest)
         for end, why, rest in (
-            *_at_merges(merged, entries),
-            *((end, JOINED, _FOREIGN) for end in _joining(merged, entries, ridges)),
-            *_at_tips(merged, entries, ridges),
+            *_at_merges(joints, entries),
+            *((end, JOINED, _FOREIGN) for end in _joining(joints, entries, ridges)),
+            *_at_tips(joints, entries, ridges),
         )
     ]
 
 
-def _at_merges(merged: Merged, entries: list[int]) -> list[tuple[int, str, float]]:
-    within = within_reach(merged.price)
+def _at_merges(joints: Joints, entries: list[int]) -> list[tuple[int, str, float]]:
+    within = joints.within_reach()
     found = []
     for entry in entries[1:]:
-        if entry in merged.hidden:
+        if entry in joints.hidden:
             found.append((entry, HIDDEN, _HIDDEN))
             continue
-        price = merged.price[entry, merged.partner[entry]]
-        lead = min(_lead(merged, entry, entries, within), FREE_END)
+        price = joints.price[entry, joints.partner[entry]]
+        lead = min(_lead(joints, entry, entries, within), FREE_END)
         strain = price - _REASSURANCE * lead
-        if price >= 2 * FREE_END:
+        if price >= HIGHEST:
             found.append((entry, "a sharp bend", 0.6))
         elif strain > 0:
             found.append((entry, CROSSING, max(1 - _STRAIN * strain, 0.1)))
-        ends = entry, merged.partner[entry]
-        for lead in [merged.lead[e] for e in ends if e in merged.lead][:1]:
+        ends = entry, joints.partner[entry]
+        for lead in [joints.lead[e] for e in ends if e in joints.lead][:1]:
             found.append((entry, SHARED, float(expit(lead / ENERGY))))
-        if entry in merged.bent:
+        if entry in joints.bent:
             found.append((entry, BENT, _FOREIGN))
     return found
 
 
-def _lead(merged: Merged, entry: int, entries: list[int], within: dict[int, list[int]]) -> float:
+def _lead(joints: Joints, entry: int, entries: list[int], within: dict[int, list[int]]) -> float:
     """How much more the ends cost in total if another way is taken at `entry`."""
-    other = merged.partner[entry]
+    other = joints.partner[entry]
     on_thread = {e // 2 for e in entries}
     added = [
-        swap(end, rival, merged.partner, merged.price, within)[0]
+        joints.swap(end, rival, within)[0]
         for end, partner in ((entry, other), (other, entry))
         for rival in within.get(end, ())
-        if rival != partner and not (merged.is_copy(rival, partner) and rival // 2 in on_thread)
+        if rival != partner
+        and not (joints.original(rival) == joints.original(partner) and rival // 2 in on_thread)
     ]
     return max(min(added, default=1.0), 0.0)
 
 
-def _joining(merged: Merged, entries: list[int], ridges: Ridges) -> list[int]:
+def _joining(joints: Joints, entries: list[int], ridges: Ridges) -> list[int]:
     """The free ends of other strands, as clear as the thread, that run into its side."""
-    own = [merged.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
+    own = [inward(joints.segments, e) for e in entries]
     line, tangents = np.concatenate(own), np.concatenate([chain_tangents(s) for s in own])
     strength, tree = ridges.sample(line), cKDTree(line)
     found = []
-    for end in (e for e in range(2 * len(merged.segments)) if e not in merged.partner):
-        segment = merged.segments[end // 2]
-        arm = segment[:: -1 if end % 2 else 1][:ARM]
+    for end in joints.free:
+        segment = inward(joints.segments, end)
+        arm = segment[:ARM]
         distance, at = tree.query(arm[0])
         heading = chain_tangents(arm)[len(arm) // 2]
         if distance > TOUCHING_PX or abs(float(heading @ tangents[at])) < _PARALLEL:
             continue
-        strand = [merged.segments[e // 2] for e in follow(end // 2, merged.partner)]
+        strand = [joints.segments[e // 2] for e in joints.follow(end // 2)]
         if np.max(tree.query(np.concatenate(strand))[0]) < _LEAVES_PX:  # The rim of a highlight.
             continue
         sides = strength[max(at - _SIDE, 0) : at + 1], strength[at : at + _SIDE]
@@ -123,26 +123,26 @@ def _joining(merged: Merged, entries: list[int], ridges: Ridges) -> list[int]:
     return found
 
 
-def _at_tips(merged: Merged, entries: list[int], ridges: Ridges) -> list[tuple[int, str, float]]:
-    within = within_reach(merged.price)
+def _at_tips(joints: Joints, entries: list[int], ridges: Ridges) -> list[tuple[int, str, float]]:
+    within = joints.within_reach()
     found = []
     for tip in (entries[0], entries[-1] ^ 1):
-        if _runs_into_another(merged, tip, entries, ridges):
-            on = min((merged.price[tip, j] for j in within.get(tip, ())), default=np.inf)
+        if _runs_into_another(joints, tip, entries, ridges):
+            on = min((joints.price[tip, j] for j in within.get(tip, ())), default=np.inf)
             rest = 0.25 if on < _RUNS_ON else 0.4
             found.append((tip, "an end beside another ridge", rest))
     return found
 
 
-def _runs_into_another(merged: Merged, tip: int, entries: list[int], ridges: Ridges) -> bool:
+def _runs_into_another(joints: Joints, tip: int, entries: list[int], ridges: Ridges) -> bool:
     """Whether another ridge is at a tip, or, without a gap before it, the thread itself."""
-    segment, own = merged.segments[tip // 2], {e // 2 for e in entries}
-    end = segment[-(tip % 2)]
-    others = [s for k, s in enumerate(merged.segments) if k not in own]
+    segment, own = inward(joints.segments, tip), {e // 2 for e in entries}
+    end = segment[0]
+    others = [s for k, s in enumerate(joints.segments) if k not in own]
     if others and _nearest(np.concatenate(others), end)[1] < TOUCHING_PX:
         return True
-    passing = [merged.segments[k] for k in own - {tip // 2}]
-    passing.append(segment[: -2 * ARM] if tip % 2 else segment[2 * ARM :])
+    passing = [joints.segments[k] for k in own - {tip // 2}]
+    passing.append(segment[2 * ARM :])
     points = np.concatenate(passing)
     if not len(points):
         return False

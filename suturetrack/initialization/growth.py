@@ -10,8 +10,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.doubts import FADES, Doubt, doubts
+from suturetrack.initialization.joints import inward
 from suturetrack.initialization.model import InitializationConfig, ViewGrowth
-from suturetrack.initialization.paths import follow
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
 from suturetrack.kernels import growth as kernel
@@ -73,7 +73,7 @@ class Thread:
     @property
     def pieces(self) -> list[Float64]:
         """The segments in order, each run in the direction of the thread."""
-        return [self.ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in self.entries]
+        return [inward(self.ridges.segments, entry) for entry in self.entries]
 
     @property
     def others(self) -> Float64:
@@ -89,11 +89,11 @@ def follow_thread(
     ridges: Ridges, origin: int, config: InitializationConfig, depth: Depth | None = None
 ) -> Thread:
     """The merged segments through segment `origin`."""
-    merged = merge_ends(ridges, config, depth)
-    ridges = replace(ridges, segments=merged.segments)
-    entries = _without_faint_ends(ridges, follow(origin, merged.partner), origin)
-    pieces = [ridges.segments[e // 2][:: -1 if e % 2 else 1] for e in entries]
-    chain = Chain(_join(pieces), tuple(doubts(merged, entries, ridges)))
+    joints = merge_ends(ridges, config, depth)
+    ridges = replace(ridges, segments=tuple(joints.segments))
+    entries = _without_faint_ends(ridges, joints.follow(origin), origin)
+    line = _join([inward(ridges.segments, entry) for entry in entries])
+    chain = Chain(line, tuple(doubts(joints, entries, ridges)))
     return Thread(ridges, entries, origin, chain)
 
 

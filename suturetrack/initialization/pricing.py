@@ -30,7 +30,9 @@ _AT_ONCE = 4096
 TOUCHING_PX = 6.0
 """Ends this near over ridge belong together at any angle: a sharp bend."""
 FREE_END = 0.5
-"""Price of an end without a partner: two of them make the highest price of a merge."""
+"""Price of an end without a partner."""
+HIGHEST = 2 * FREE_END
+"""The highest price that is paid for a merge: that of the two ends without it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ class Merge:
     pairs: Int64
     """(m, 2)."""
     cost: Float64
-    """(m,) 1 is the highest price that is paid."""
+    """(m,)."""
     touching: Bool
     """(m,) whether ridge joins the two ends, whatever their angle."""
 

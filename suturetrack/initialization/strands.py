@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
 from suturetrack.initialization.depth import Depth, Disparities
+from suturetrack.initialization.joints import Pair, inward
 from suturetrack.initialization.pricing import Merge
 from suturetrack.metrics import arc_lengths
 from suturetrack.types import Float64
@@ -41,7 +42,7 @@ class Strands:
 
     def __init__(
         self,
-        segments: tuple[Float64, ...],
+        segments: Sequence[Float64],
         partner: dict[int, int],
         merges: Merge | None,
         depth: Depth | None,
@@ -65,7 +66,7 @@ class Strands:
                 cost[k] += ENERGY * self._step(i, j)
         return Merge(merges.pairs, cost, merges.touching)
 
-    def change(self, pairs: list[tuple[int, int]], others: list[tuple[int, int]]) -> float | None:
+    def change(self, pairs: list[Pair], others: list[Pair]) -> float | None:
         """What it would cost if the arms of some ends were joined as `others`, and not as `pairs`;
         None where an arm is too short to tell."""
         if min(len(self._arm(end)) for pair in pairs for end in pair) < _LEAST_ARM:
@@ -115,7 +116,7 @@ class Strands:
         total, seen = 0, set()
         while total < REACH and end // 2 not in seen:
             seen.add(end // 2)
-            piece = self._segments[end // 2][:: -1 if end % 2 else 1]
+            piece = inward(self._segments, end)
             shared = max(self._lead(end), self._lead(end ^ 1)) < _CLOSE_RIVAL
             if len(piece) < REACH and shared:
                 break
