@@ -7,7 +7,15 @@ from scipy.spatial import cKDTree
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization.doubts import CROSSING, FADES, FOREIGN, HIDDEN, SHARED, Doubt
+from suturetrack.initialization.doubts import (
+    CROSSING,
+    FADES,
+    FOREIGN,
+    HIDDEN,
+    SHARED,
+    SHARP,
+    Doubt,
+)
 from suturetrack.initialization.growth import Chain
 from suturetrack.initialization.model import PlacedDoubts, remaining
 from suturetrack.initialization.samples import Samples
@@ -15,12 +23,13 @@ from suturetrack.initialization.segments import Ridges
 from suturetrack.metrics import arc_lengths, coverage, polyline_at, polyline_length
 from suturetrack.types import Float64, Int64, Nurbs
 
-_AGREED = 0.95
-"""Share of the thread from which both views are said to agree."""
+AGREED = 0.95
+"""Share of the thread from which two views are said to agree."""
 _DISAGREED = 0.5
 """What is left of the confidence where they do not: of such starts that nothing else made doubtful, seven
 of eight were wrong."""
-_NEAR_PX = 3.0
+NEAR_PX = 3.0
+"""How far apart they run there, at most."""
 _SEEN = 0.1
 """Response from which a crest counts as seen."""
 _VAGUE = 0.0026
@@ -43,7 +52,7 @@ _ALONE = 4.0
 """How many times better the odds are that a thread that is alone goes on as it was found to: another way
 would leave a part of it to nobody. Of 171 such starts, 169 were right and as many in order, however much
 was in doubt."""
-_SHARP = 0.5
+_SHARP_REST = 0.5
 """What is left of the confidence at a sharp bend, at least, where no other ridge is near."""
 _SHARP_COSINE = 0.5
 _BEND_REACH = 8
@@ -76,22 +85,9 @@ def judge(
         rig: the cameras.
         scale: what makes the pixels of all these those of the whole image.
     """
-    reasons = []
     pixels = rig.project(nurbs.evaluate(curve, np.linspace(0, 1, 32 * len(curve.control_points))))
     agreement = min(_agreement(p, c.pixels, rig) for p, c in zip(pixels, chains, strict=True))
-    confidence = agreement**2
-    if agreement < _AGREED:
-        reasons.append(f"left and right view agree about {agreement:.0%} of the thread only")
-        confidence *= _DISAGREED
-    seen = float(np.mean([(c.response > _SEEN).mean() for c in samples.crests]))
-    if seen < 0.95:
-        reasons.append(f"uncertain stretches: {1 - seen:.0%} of the thread is not seen")
-    confidence *= seen
-    vague = float(np.quantile(sigma, 0.25)) / nurbs.length(curve)
-    held = 1 / (1 + (vague / _VAGUE) ** 6)
-    if held < _HELD:
-        reasons.append(f"uncertain depth: even its best parts to {vague:.1%} of the length only")
-    confidence *= held
+    confidence, reasons = _of_the_whole(agreement, samples, sigma, nurbs.length(curve))
     doubts = [_settled(_distinct(c), p, r) for c, p, r in zip(chains, pixels, ridges, strict=True)]
     doubts = [_confirmed(view, doubts, pixels) for view in (0, 1)]
     if max(_others(line, r) for line, r in zip(pixels, ridges, strict=True)) <= _NEXT_TO_NOTHING:
@@ -103,23 +99,38 @@ def judge(
         ]
     left, right = (_placed(view, doubts, pixels, chains) for view in (0, 1))
     confidence *= remaining((left, right))
-    for end in (0, 1):
+    for end, ordinal in enumerate(("first", "last")):
         readings = [samples.ends[view][end] for view in (0, 1)]
         if any(r.at_border for r in readings):
-            reasons.append(f"{_ORDINAL[end]} end cut by the image border")
+            reasons.append(f"{ordinal} end cut by the image border")
         elif all(np.isnan(r.offset_px) for r in readings):
             confidence *= _NO_END
-            reasons.append(f"{_ORDINAL[end]} end not seen as an end")
+            reasons.append(f"{ordinal} end not seen as an end")
     return float(confidence), tuple(reasons), (left, right)
 
 
-_ORDINAL = ("first", "last")
+def _of_the_whole(
+    agreement: float, samples: Samples, sigma: Float64, length: float
+) -> tuple[float, list[str]]:
+    """The confidence in a curve of this length before its doubts, and what lowers it."""
+    confidence, reasons = agreement**2, []
+    if agreement < AGREED:
+        reasons.append(f"left and right view agree about {agreement:.0%} of the thread only")
+        confidence *= _DISAGREED
+    seen = float(np.mean([(c.response > _SEEN).mean() for c in samples.crests]))
+    if seen < 0.95:
+        reasons.append(f"uncertain stretches: {1 - seen:.0%} of the thread is not seen")
+    vague = float(np.quantile(sigma, 0.25)) / length
+    held = 1 / (1 + (vague / _VAGUE) ** 6)
+    if held < _HELD:
+        reasons.append(f"uncertain depth: even its best parts to {vague:.1%} of the length only")
+    return confidence * seen * held, reasons
 
 
 def clarity(chain: Chain, places: Float64) -> float:
     """What the doubts of one view about a chain near (k, 2) places leave of the confidence in it."""
-    doubts = [(where, rest) for where, why, rest in _distinct(chain) if why not in FOREIGN]
-    return float(np.prod([rest for where, rest in doubts if _is_near(where, places)]))
+    doubts = [doubt for doubt in _distinct(chain) if doubt.why not in FOREIGN]
+    return float(np.prod([doubt.rest for doubt in doubts if _is_near(doubt.place, places)]))
 
 
 def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
@@ -129,15 +140,16 @@ def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
     way that the thread might take: at most it is another thread that goes on behind a sharp bend.
     """
     kept = []
-    for place, why, rest in doubts:
-        if why in (*FOREIGN, HIDDEN):
-            kept.append((place, why, rest))
-            continue
-        near = np.flatnonzero(np.linalg.norm(line - place, axis=1) <= _SAME_PLACE_PX)
-        if not _is_one_pass(line, near) or not _is_all_ridge(place, line, near, ridges):
-            kept.append((place, why, rest))
+    for doubt in doubts:
+        near = np.flatnonzero(np.linalg.norm(line - doubt.place, axis=1) <= _SAME_PLACE_PX)
+        if (
+            doubt.why in (*FOREIGN, HIDDEN)
+            or not _is_one_pass(line, near)
+            or not _is_all_ridge(doubt.place, line, near, ridges)
+        ):
+            kept.append(doubt)
         elif _bends_sharply(line[near]):
-            kept.append((place, "a sharp bend", max(rest, _SHARP)))
+            kept.append(Doubt(doubt.place, SHARP, max(doubt.rest, _SHARP_REST)))
     return kept
 
 
@@ -172,17 +184,17 @@ def _confirmed(view: int, doubts: list[list[Doubt]], lines: tuple[Float64, Float
     """The doubts of a view, and whether a part is another thread's only where the other view doubts it
     as well: strands meet, or draw each other aside, in one view alone."""
     kept = []
-    for place, why, rest in doubts[view]:
-        there = lines[1 - view][np.argmin(np.linalg.norm(lines[view] - place, axis=1))]
-        if why not in FOREIGN or _same(why, there, doubts[1 - view]):
-            kept.append((place, why, rest))
+    for doubt in doubts[view]:
+        there = lines[1 - view][np.argmin(np.linalg.norm(lines[view] - doubt.place, axis=1))]
+        if doubt.why not in FOREIGN or _same(doubt.why, there, doubts[1 - view]):
+            kept.append(doubt)
     return kept
 
 
 def _same(why: str, place: Float64, doubts: list[Doubt]) -> list[float]:
     """What doubts of a kind near a place of their view leave of the confidence."""
     kinds = FOREIGN if why in FOREIGN else (why,)
-    return [rest for where, kind, rest in doubts if kind in kinds and _is_near(where, place[None])]
+    return [d.rest for d in doubts if d.why in kinds and _is_near(d.place, place[None])]
 
 
 def _is_shared(place: Float64, line: Float64, counterpart: Float64, chain: Float64) -> bool:
@@ -191,7 +203,7 @@ def _is_shared(place: Float64, line: Float64, counterpart: Float64, chain: Float
     near = np.linalg.norm(line - place, axis=1) <= _SAME_PLACE_PX
     if not near.any() or len(chain) < 2:
         return False
-    return coverage(chain, counterpart[near], _NEAR_PX) >= _AGREED
+    return coverage(chain, counterpart[near], NEAR_PX) >= AGREED
 
 
 def _others(line: Float64, ridges: Ridges) -> float:
@@ -204,10 +216,9 @@ def _others(line: Float64, ridges: Ridges) -> float:
 
 def _of_itself(doubt: Doubt) -> Doubt:
     """A doubt about where the thread goes on, of one that is alone: it meets nothing but itself."""
-    place, why, rest = doubt
-    if why in (CROSSING, SHARED):
-        rest = _ALONE * rest / (_ALONE * rest + 1 - rest)
-    return place, why, rest
+    if doubt.why not in (CROSSING, SHARED):
+        return doubt
+    return doubt._replace(rest=_ALONE * doubt.rest / (_ALONE * doubt.rest + 1 - doubt.rest))
 
 
 def _is_one_pass(line: Float64, near: Int64) -> bool:
@@ -241,15 +252,14 @@ def _distinct(chain: Chain) -> list[Doubt]:
     """The doubts, the gravest first, one of a kind for each place: about other threads, about stretches that
     strands share, and all the rest."""
     kept: list[Doubt] = []
-    for doubt in sorted(chain.doubts, key=lambda d: d[2]):
-        alike = [d for d in kept if _kind(d) == _kind(doubt)]
-        if all(np.linalg.norm(doubt[0] - other[0]) > _SAME_PLACE_PX for other in alike):
+    for doubt in sorted(chain.doubts, key=lambda d: d.rest):
+        alike = [d.place for d in kept if _kind(d.why) == _kind(doubt.why)]
+        if all(np.linalg.norm(doubt.place - place) > _SAME_PLACE_PX for place in alike):
             kept.append(doubt)
     return kept
 
 
-def _kind(doubt: Doubt) -> str:
-    why = doubt[1]
+def _kind(why: str) -> str:
     return FOREIGN[0] if why in FOREIGN else SHARED if why == SHARED else CROSSING
 
 
@@ -258,4 +268,4 @@ def _agreement(pixels: Float64, chain: Float64, rig: StereoRig) -> float:
     inside = ((pixels >= 0) & (pixels <= np.array(rig.image_size) - 1)).all(1)
     if len(chain) < 2 or inside.sum() < 2:
         return 0.0
-    return min(coverage(chain, pixels[inside], _NEAR_PX), coverage(pixels, chain, _NEAR_PX))
+    return min(coverage(chain, pixels[inside], NEAR_PX), coverage(pixels, chain, NEAR_PX))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import expit
@@ -12,9 +14,6 @@ from suturetrack.initialization.segments import ARM, Ridges, chain_tangents
 from suturetrack.initialization.strands import ENERGY
 from suturetrack.types import Float64
 
-Doubt = tuple[Float64, str, float]
-"""A pixel (2,), what is doubtful there, and the confidence that this leaves."""
-
 CROSSING = "an ambiguous crossing"
 """Where the thread might leave a crossing another way."""
 SHARED = "a stretch that two strands share"
@@ -23,6 +22,7 @@ JOINED = "another strand that ends on it"
 """Where two strands come and one goes on: it may be the other one."""
 BENT = "a bend as of two strands"
 """Where the thread may end, and another one go on from there."""
+SHARP = "a sharp bend"
 FADES = "a fainter ridge behind an end"
 HIDDEN = "a hidden stretch"
 """What is seen on both sides of it may be two threads."""
@@ -51,11 +51,21 @@ _SIDE = 40
 """Points of the thread on each side of a place whose strength counts there."""
 
 
+class Doubt(NamedTuple):
+    """Where a thread may run another way."""
+
+    place: Float64
+    """(2,) pixel."""
+    why: str
+    rest: float
+    """The confidence that this leaves."""
+
+
 def doubts(joints: Joints, entries: list[int], ridges: Ridges) -> list[Doubt]:
     """What is doubtful about the thread that enters its segments at `entries`; `ridges` are those that
     were joined."""
     return [
-        (inward(joints.segments, end)[0], why, rest)
+        Doubt(inward(joints.segments, end)[0], why, rest)
         for end, why, rest in (
             *_at_merges(joints, entries),
             *((end, JOINED, _FOREIGN) for end in _joining(joints, entries, ridges)),
@@ -75,7 +85,7 @@ def _at_merges(joints: Joints, entries: list[int]) -> list[tuple[int, str, float
         lead = min(_lead(joints, entry, entries, within), FREE_END)
         strain = price - _REASSURANCE * lead
         if price >= HIGHEST:
-            found.append((entry, "a sharp bend", 0.6))
+            found.append((entry, SHARP, 0.6))
         elif strain > 0:
             found.append((entry, CROSSING, max(1 - _STRAIN * strain, 0.1)))
         ends = entry, joints.partner[entry]

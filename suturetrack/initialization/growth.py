@@ -108,9 +108,9 @@ def without_faint_tails(thread: Thread, place: Float64) -> Thread:
     if stop - start == len(strength):
         return thread
     pixels = chain.pixels[start:stop]
-    left = [d for d in chain.doubts if np.linalg.norm(pixels - d[0], axis=1).min() < _WINDOW]
+    left = [d for d in chain.doubts if np.linalg.norm(pixels - d.place, axis=1).min() < _WINDOW]
     cut = [end for end, at in ((0, start), (-1, len(strength) - stop)) if at > 0]
-    left += [(pixels[end], FADES, _FAINTER) for end in cut]
+    left += [Doubt(pixels[end], FADES, _FAINTER) for end in cut]
     return replace(thread, chain=Chain(pixels, tuple(left)))
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from suturetrack.initialization.confidence import clarity
+from suturetrack.initialization.confidence import AGREED, NEAR_PX, clarity
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.growth import (
     Chain,
@@ -21,9 +21,6 @@ from suturetrack.initialization.segments import Ridges
 from suturetrack.metrics import coverage, polyline_distances
 from suturetrack.types import Float64, RidgeField
 
-AGREED = 0.95
-"""Share of a thread on which two views must agree."""
-_NEAR_PX = 3.0
 _UNMATCHED = 0.35
 """Response, against that of a thread, below which the other view does not show it."""
 _UNMATCHED_PRICE = 12.0
@@ -109,7 +106,7 @@ def _agreement(one: Float64, other: Float64) -> float:
     """The lesser share of two chains, (k, 2) and (m, 2), that runs along the other."""
     if len(one) < 2 or len(other) < 2:
         return 0.0
-    return min(coverage(one, other, _NEAR_PX), coverage(other, one, _NEAR_PX))
+    return min(coverage(one, other, NEAR_PX), coverage(other, one, NEAR_PX))
 
 
 def _worth(thread: Thread, matched: Match, other: Match) -> float:
@@ -129,7 +126,7 @@ def _worth(thread: Thread, matched: Match, other: Match) -> float:
 
 def _partings(one: Float64, other: Float64) -> Float64:
     """(k, 2) where the chain `one` leaves the other, or comes back to it."""
-    apart = polyline_distances(one, other) > _NEAR_PX
+    apart = polyline_distances(one, other) > NEAR_PX
     return one[:-1][apart[1:] != apart[:-1]]
 
 
