@@ -172,8 +172,7 @@ def _rows(
 ) -> tuple[Float64, Float64]:
     """Band and gradient of what (k, 3, 3) and (k, 3) ask of a derivative at the samples."""
     first, table = spline.local_basis(samples.s, curve.knots)
-    size = curve.control_points.size
-    band, gradient = np.zeros((size, spline.BANDWIDTH)), np.zeros(size)
+    band, gradient = spline.no_rows(len(curve.control_points))
     spline.add_rows(first, table[order], information, pull, band, gradient)
     return band, gradient
 

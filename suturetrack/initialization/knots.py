@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from suturetrack import nurbs
-from suturetrack.initialization.samples import Samples
+from suturetrack.initialization.samples import Samples, gram
 from suturetrack.kernels import spline
 from suturetrack.types import Float64, Nurbs
 
@@ -30,8 +30,8 @@ def image_parameters(left: Float64, right: Float64) -> Float64:
 
 def fit_marks(points: Float64, s: Float64, spans: int) -> Nurbs:
     """Least-squares curve through (k, 3) stereo points at parameters `s` (end of Section V)."""
-    knots = nurbs.clamped_knots(np.linspace(0, 1, spans + 1)[1:-1], spline.DEGREE)
-    return _closest(knots, s, points, np.tile(np.eye(3), (len(s), 1, 1)))
+    interior = np.linspace(0, 1, spans + 1)[1:-1]
+    return _closest(interior, s, points, np.tile(np.eye(3), (len(s), 1, 1)))
 
 
 def with_needed_knots(samples: Samples) -> Nurbs:
@@ -40,13 +40,11 @@ def with_needed_knots(samples: Samples) -> Nurbs:
     Spans are halved, by misfit, until none fits the crests significantly worse than the samples do.
     An end along an epipolar line has the depth of the samples: the crests say nothing of it.
     """
-    disparity = samples.image_axes[:, 2:]
-    deep = _STAY_DEEP * np.einsum("kij,kil->kjl", disparity, disparity)
+    deep = _STAY_DEEP * gram(samples.image_axes[:, 2:])
     places = samples.crest_information() + samples.rest_information() + deep
     interior = np.array([0.5])
     while True:
-        knots = nurbs.clamped_knots(interior, spline.DEGREE)
-        curve = _closest(knots, samples.s, samples.points, places)
+        curve = _closest(interior, samples.s, samples.points, places)
         new = _splits(samples.s, _excess(curve, samples) / samples.variance, interior)
         if not new:
             return curve
@@ -76,15 +74,8 @@ def _splits(s: Float64, excess: Float64, interior: Float64) -> list[float]:
     return new
 
 
-def _closest(knots: Float64, s: Float64, points: Float64, information: Float64) -> Nurbs:
+def _closest(interior: Float64, s: Float64, points: Float64, information: Float64) -> Nurbs:
     """The curve closest to (k, 3) points where (k, 3, 3) `information` says that it matters."""
-    first, table = spline.local_basis(s, knots)
-    count = len(knots) - spline.DEGREE - 1
-    band, gradient = np.zeros((3 * count, spline.BANDWIDTH)), np.zeros(3 * count)
-    pull = np.einsum("kij,kj->ki", information, points)
-    spline.add_rows(first, table[0], information, pull, band, gradient)
-    band[:, 0] *= 1 + _RIDGE
-    if not spline.factorize(band):
-        raise FloatingPointError("the samples do not hold the curve")
-    control_points = spline.solve_factorized(band, gradient).reshape(-1, 3)
+    knots = nurbs.clamped_knots(interior, spline.DEGREE)
+    control_points = spline.closest(knots, s, points, information, _RIDGE)
     return nurbs.curve_from(spline.DEGREE, knots, control_points)

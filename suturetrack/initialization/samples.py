@@ -132,7 +132,7 @@ class Samples:
         tangents = np.c_[normals[:, 1], -normals[:, 0]]
         rows = np.einsum("ki,kij->kj", tangents, self.jacobians[0])
         unseen = np.minimum(self.crests[0].trust, self.crests[1].trust) < _UNSEEN
-        anywhere = unseen[:, None, None] * _squared(self.image_axes)
+        anywhere = unseen[:, None, None] * gram(self.image_axes)
         return _STAY * (rows[:, :, None] * rows[:, None] + anywhere)
 
     def bending_information(self, second: Float64) -> tuple[Float64, Float64]:
@@ -145,7 +145,7 @@ class Samples:
         bend = np.einsum("kij,kj->ki", image[:, :2], second)
         squared = gaussian_filter1d((bend**2).sum(1), _BEND_SAMPLES)
         freedom = squared / max(squared.mean(), 1e-12) + _LEAST_FREEDOM
-        return _squared(image[:, :2]), _squared(image[:, 2:]) / freedom[:, None, None]
+        return gram(image[:, :2]), gram(image[:, 2:]) / freedom[:, None, None]
 
     def end_equations(self) -> tuple[Float64, Float64]:
         """What the images say about the places of both ends along the thread: (2, 3, 3) and (2, 3).
@@ -167,6 +167,6 @@ class Samples:
         return information, pull
 
 
-def _squared(rows: Float64) -> Float64:
+def gram(rows: Float64) -> Float64:
     """(k, 3, 3) sums over the squares of (k, m, 3) rows."""
     return np.einsum("kij,kil->kjl", rows, rows)

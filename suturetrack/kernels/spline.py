@@ -171,6 +171,33 @@ def add_rows(
                             band[row + a, d] += v * information[j, a, b]
 
 
+def closest(
+    knots: Float64, s: Float64, points: Float64, information: Float64, ridge: float = 0.0
+) -> Float64:
+    """(n + 1, 3) control points of the cubic curve that is closest to (k, 3) points at (k,) parameters.
+
+    Args:
+        information: (k, 3, 3) how much each point matters, by direction.
+        ridge: share by which the diagonal of the normal equations is raised.
+
+    Raises:
+        FloatingPointError: the points do not hold the curve.
+    """
+    first, table = local_basis(s, knots)
+    band, gradient = no_rows(len(knots) - ORDER)
+    pull = np.einsum("kij,kj->ki", information, points)
+    add_rows(first, table[0], information, pull, band, gradient)
+    band[:, 0] *= 1 + ridge
+    if not factorize(band):
+        raise FloatingPointError("the points do not hold the curve")
+    return solve_factorized(band, gradient).reshape(-1, 3)
+
+
+def no_rows(count: int) -> tuple[Float64, Float64]:
+    """The band and the gradient of normal equations of so many control points, for `add_rows`."""
+    return np.zeros((3 * count, BANDWIDTH)), np.zeros(3 * count)
+
+
 @numba.njit(cache=True, nogil=True)
 def factorize(band: Float64) -> bool:
     """Cholesky factor of the lower band, in place; False where it is not positive definite."""

@@ -42,16 +42,15 @@ def refit(curve: Nurbs, interior: Float64) -> Nurbs:
     every = np.unique(np.r_[knots, curve.knots])
     s = (every[:-1, None] + np.diff(every)[:, None] * np.linspace(0, 1, 6)).ravel()
     s[[0, -1]] = 0.0, 1.0
-    samples = Samples.at(knots, s)
+    return through(knots, s, values_at(curve, s))
+
+
+def through(knots: Float64, s: Float64, points: Float64) -> Nurbs:
+    """The cubic curve closest to (k, 3) points at (k,) parameters, between the first and the last."""
     weight = np.ones(len(s))
     weight[[0, -1]] = 1e6
-    band = np.zeros((3 * (len(knots) - spline.ORDER), spline.BANDWIDTH))
-    right = np.zeros(len(band))
     information = weight[:, None, None] * np.eye(3)
-    pull = weight[:, None] * values_at(curve, s)
-    spline.add_rows(samples.first, samples.table[0], information, pull, band, right)
-    spline.factorize(band)
-    return curve_from(3, knots, spline.solve_factorized(band, right).reshape(-1, 3))
+    return curve_from(spline.DEGREE, knots, spline.closest(knots, s, points, information))
 
 
 def _spans(curve: Nurbs, rig: StereoRig) -> tuple[Float64, Float64]:

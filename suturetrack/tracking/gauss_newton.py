@@ -333,8 +333,7 @@ class _Equations:
     """Normal equations of one step of the control points."""
 
     def __init__(self, count: int) -> None:
-        self.band = np.zeros((3 * count, spline.BANDWIDTH))
-        self.gradient = np.zeros(3 * count)
+        self.band, self.gradient = spline.no_rows(count)
 
     def add_tips(self, tips: Sequence[tuple[float, Float64] | None], back: Float64) -> None:
         """Rows for what the views show differently at the ends.

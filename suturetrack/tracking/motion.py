@@ -85,8 +85,7 @@ class Motion:
 def _fit(information: Float64, velocity: Float64, s: Float64) -> Float64:
     """(m, 3) coefficients of the smoothest velocity that the information allows."""
     samples = Samples.at(_KNOTS, s)
-    count = len(_KNOTS) - spline.ORDER
-    band, right = np.zeros((3 * count, spline.BANDWIDTH)), np.zeros(3 * count)
+    band, right = spline.no_rows(len(_KNOTS) - spline.ORDER)
     pull = (information @ velocity[:, :, None])[:, :, 0]
     spline.add_rows(samples.first, samples.table[0], information, pull, band, right)
     scale = float(np.trace(information, axis1=1, axis2=2).mean()) + np.finfo(float).tiny

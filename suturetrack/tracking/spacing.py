@@ -6,8 +6,8 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import spline
-from suturetrack.nurbs import clamped_knots, curve_from, evaluate, evenly_spaced
-from suturetrack.tracking.sampling import Samples
+from suturetrack.nurbs import clamped_knots, evaluate, evenly_spaced
+from suturetrack.tracking.control_points import through
 from suturetrack.types import Float64, Nurbs
 
 # Clamped knots draw the outermost control points of an even curve together by these factors.
@@ -42,21 +42,7 @@ def evenly(curve: Nurbs, spans: int) -> Nurbs:
     count = _SAMPLES_PER_SPAN * spans + 1
     points = evaluate(curve, evenly_spaced(curve, count))
     knots = clamped_knots(np.linspace(0, 1, spans + 1)[1:-1], spline.DEGREE)
-    samples = Samples.at(knots, np.linspace(0, 1, count))
-    weight = np.ones(count)
-    weight[[0, -1]] = 1e6
-    band = np.zeros((3 * (spans + spline.DEGREE), spline.BANDWIDTH))
-    right = np.zeros(len(band))
-    spline.add_rows(
-        samples.first,
-        samples.table[0],
-        weight[:, None, None] * np.eye(3),
-        weight[:, None] * points,
-        band,
-        right,
-    )
-    spline.factorize(band)
-    return curve_from(spline.DEGREE, knots, spline.solve_factorized(band, right).reshape(-1, 3))
+    return through(knots, np.linspace(0, 1, count), points)
 
 
 def _gaps(curve: Nurbs, rig: StereoRig) -> Float64:
