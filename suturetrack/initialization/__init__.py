@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -111,18 +112,17 @@ def _initialize(
         reason = _nothing_there(scale * candidates, scale * pixel, config)
         raise InitializationError(reason, candidates)
     thread = follow_thread(left, origin, config)
-    rows = row_offset(thread.chain.pixels, field.left, field.right, rig.disparity_at_infinity)
+    start = _Start(left, thread, candidates, rig, pixel, config, scale)
+    infinity = rig.disparity_at_infinity
+    rows = row_offset(thread.chain.pixels, field.left, field.right, infinity)
+    if not rows:
+        return _reconstruct(start, field)
     found: Initialization | None = None
-    try:
-        found = _reconstruct(field, left, thread, rig, pixel, config, scale)
-    except InitializationError:
-        if not rows:
-            raise
-    if found is not None and not rows:
-        return found
+    with suppress(InitializationError):
+        found = _reconstruct(start, field)
     moved = RidgeField(field.stamp, field.left, raised(field.right, rows))
     try:
-        other = _reconstruct(moved, left, thread, rig, pixel, config, scale)
+        other = _reconstruct(start, moved)
     except InitializationError:
         if found is None:
             raise
@@ -131,58 +131,68 @@ def _initialize(
     if found is not None and abs(found.row_offset_px) <= abs(other.row_offset_px):
         return found
     total = rows + other.row_offset_px
-    return replace(other, curve=_shared(other.curve, rows, rig), row_offset_px=total)
+    return replace(other, curve=_halfway(other.curve, rows, rig), row_offset_px=total)
 
 
-def _shared(curve: Nurbs, rows: float, rig: StereoRig) -> Nurbs:
+def _halfway(curve: Nurbs, rows: float, rig: StereoRig) -> Nurbs:
     """A curve on the rows of the left view, half as far from those of the right view's `rows` lower."""
     points = curve.control_points.copy()
     points[:, 1] += rows / 2 * points[:, 2] / rig.left.projection[1, 1]
     return curve_from(curve.degree, curve.knots, points)
 
 
-def _reconstruct(
-    field: RidgeField,
-    left: Ridges,
-    thread: Thread,
-    rig: StereoRig,
-    pixel: Float64,
-    config: InitializationConfig,
-    scale: int,
-) -> Initialization:
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """A thread of the left view, by itself, and what it is looked for with in the right one."""
+
+    left: Ridges
+    thread: Thread
+    candidates: Float64
+    """(k, 2) of `InitializationError`."""
+    rig: StereoRig
+    pixel: Float64
+    """(2,) the seed."""
+    config: InitializationConfig
+    scale: int
+    """What makes the pixels of all these those of the whole image."""
+
+
+def _reconstruct(start: _Start, field: RidgeField) -> Initialization:
     """The curve of a thread of the left view."""
-    candidates = nearest_segment(left, pixel, config.snap_px)[1]
-    ridges = left, find_ridges(field.right, config)
-    found = find_thread(field, ridges, thread, pixel, rig.disparity_at_infinity, config)
-    pixels = found.pixels
+    rig, config, infinity = start.rig, start.config, start.rig.disparity_at_infinity
+    ridges = start.left, find_ridges(field.right, config)
+    found = find_thread(field, ridges, start.thread, start.pixel, infinity, config)
     step = max(1, round(config.step_px))
-    marks = pixels[::step].reshape(-1, 2, 2)
-    growth = Growth(*_growths(found, ridges[1], pixel, config), marks)
-    if len(pixels) < _SHORTEST_STEPS * step:
-        reason = f"the ridge at the seed is only {scale * len(pixels)} px long"
-        raise InitializationError(reason, candidates, growth)
+    marks = found.pixels[::step].reshape(-1, 2, 2)
+    growth = Growth(*_growths(found, ridges[1], start.pixel, config), marks)
+    if len(found.pixels) < _SHORTEST_STEPS * step:
+        reason = f"the ridge at the seed is only {start.scale * len(found.pixels)} px long"
+        raise InitializationError(reason, start.candidates, growth)
     if not _is_matched(found.matched):
-        swapped = match(
-            found.left.chain.pixels, field.left, field.right, rig.disparity_at_infinity, -1
-        )
-        raise InitializationError(_no_match(swapped), candidates, growth)
-    pixels = _trim(pixels, left)
-    s = image_parameters(pixels[:, :2], pixels[:, 2:])
-    points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
-    curve = fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
+        swapped = match(found.left.chain.pixels, field.left, field.right, infinity, -1)
+        raise InitializationError(_no_match(swapped), start.candidates, growth)
     views = (
         View(field.left, found.left.others),
         View(field.right, np.empty((0, 2)) if found.right is None else found.right.others),
     )
     try:
+        curve = _first_curve(_trim(found.pixels, start.left), rig, config)
         curve, samples, sigma, rows = refine(curve, views, rig)
     except FloatingPointError as error:
-        raise InitializationError(
-            f"no curve fits both views: {error}", candidates, growth
-        ) from None
+        reason = f"no curve fits both views: {error}"
+        raise InitializationError(reason, start.candidates, growth) from None
     shown = rig.with_row_offset(rows)
-    confidence, reasons, doubts = judge(curve, samples, sigma, found.chains, ridges, shown, scale)
+    confidence, reasons, doubts = judge(
+        curve, samples, sigma, found.chains, ridges, shown, start.scale
+    )
     return Initialization(curve, confidence, reasons, samples.distance_px, growth, doubts, rows)
+
+
+def _first_curve(pixels: Float64, rig: StereoRig, config: InitializationConfig) -> Nurbs:
+    """The curve through the stereo points of a (k, 4) chain, left and right pixels."""
+    s = image_parameters(pixels[:, :2], pixels[:, 2:])
+    points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
+    return fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
 
 
 def _reduced(view: Float32, scale: int) -> Float32:
