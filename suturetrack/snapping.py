@@ -11,8 +11,7 @@ import numpy as np
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationConfig, InitializationError, initialize
-from suturetrack.initialization.growth import nearest_segment
-from suturetrack.initialization.segments import find_ridges
+from suturetrack.initialization.segments import find_ridges, nearest_segment
 from suturetrack.types import Float32, Float64, Image, InputError, Nurbs, RidgeField, Seed
 
 _SAMPLES = 400

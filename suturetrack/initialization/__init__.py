@@ -12,7 +12,7 @@ from suturetrack.initialization.confidence import judge
 from suturetrack.initialization.crest import View
 from suturetrack.initialization.ends import move_end, read_end
 from suturetrack.initialization.fitting import refine
-from suturetrack.initialization.growth import Thread, follow_thread, grow_thread, nearest_segment
+from suturetrack.initialization.growth import grow_thread
 from suturetrack.initialization.hypotheses import Hypothesis, find_thread
 from suturetrack.initialization.knots import fit_marks, image_parameters
 from suturetrack.initialization.matching import Match, match, raised, row_offset
@@ -25,7 +25,8 @@ from suturetrack.initialization.model import (
     ViewGrowth,
     remaining,
 )
-from suturetrack.initialization.segments import Ridges, find_ridges, thread_scale
+from suturetrack.initialization.segments import Ridges, find_ridges, nearest_segment, thread_scale
+from suturetrack.initialization.threads import Thread, follow_thread
 from suturetrack.nurbs import curve_from
 from suturetrack.types import Float32, Float64, Nurbs, RidgeField, Seed
 

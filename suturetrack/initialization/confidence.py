@@ -16,10 +16,10 @@ from suturetrack.initialization.doubts import (
     SHARP,
     Doubt,
 )
-from suturetrack.initialization.growth import Chain
 from suturetrack.initialization.model import PlacedDoubts, remaining
 from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import Ridges
+from suturetrack.initialization.threads import Chain
 from suturetrack.metrics import arc_lengths, coverage, polyline_at, polyline_length
 from suturetrack.types import Float64, Int64, Nurbs
 

@@ -8,16 +8,15 @@ import numpy as np
 
 from suturetrack.initialization.confidence import AGREED, NEAR_PX, clarity
 from suturetrack.initialization.depth import Depth
-from suturetrack.initialization.growth import (
+from suturetrack.initialization.matching import Match, match
+from suturetrack.initialization.model import InitializationConfig
+from suturetrack.initialization.segments import Ridges, nearest_segment
+from suturetrack.initialization.threads import (
     Chain,
     Thread,
     follow_thread,
-    nearest_segment,
     without_faint_tails,
 )
-from suturetrack.initialization.matching import Match, match
-from suturetrack.initialization.model import InitializationConfig
-from suturetrack.initialization.segments import Ridges
 from suturetrack.metrics import coverage, polyline_distances
 from suturetrack.types import Float64, RidgeField
 

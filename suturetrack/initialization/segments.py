@@ -86,6 +86,22 @@ def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
     return Ridges(field, magnitude, split_at_touches(segments), low)
 
 
+def nearest_segment(ridges: Ridges, seed: Float64, reach: float) -> tuple[int | None, Float64]:
+    """The segment that a seed (2,) means, None if there is none within `reach`, and (k, 2) the
+    nearest ridge points, one a segment."""
+    nearest = [s[np.argmin(np.linalg.norm(s - seed, axis=1))] for s in ridges.segments]
+    if not nearest:
+        return None, np.empty((0, 2))
+    distance = np.linalg.norm(np.array(nearest) - seed, axis=1)
+    # Among ridges as near as the seed is exact, the long and clear one is meant.
+    weight = [min(len(s), 40) / 40 * ridges.sample(s).mean() for s in ridges.segments]
+    score = distance - 4 * np.array(weight)
+    score[distance > reach] = np.inf
+    candidates = np.array(nearest)[np.argsort(distance)[:3]]
+    best = int(np.argmin(score))
+    return (best if np.isfinite(score[best]) else None), candidates
+
+
 def thread_scale(ridges: Ridges, seed: Float64) -> int:
     """How many times wider than a narrow thread the ridge nearest to the seed (2,) is, 1 at least."""
     segments = [s for s in ridges.segments if len(s) >= ARM]

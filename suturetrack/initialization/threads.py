@@ -1,0 +1,140 @@
+"""The thread in one view: its segments, from end to end, and what may be doubted about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from suturetrack.initialization.depth import Depth
+from suturetrack.initialization.doubts import FADES, Doubt, doubts
+from suturetrack.initialization.joints import inward
+from suturetrack.initialization.model import InitializationConfig
+from suturetrack.initialization.segments import Ridges
+from suturetrack.initialization.topology import merge_ends
+from suturetrack.metrics import arc_lengths, resample
+from suturetrack.types import Float64
+
+_FAINT = 0.4
+"""Strength, against the rest of the thread, below which a last segment is no part of it."""
+_FALLEN = 0.42
+"""Strength, against the rest of the thread, of what goes on behind its end at most."""
+_FALL = 0.5
+"""Ratio of the strengths behind and before such an end at most: threads fade more slowly."""
+_FAINTER = 0.49
+"""What such an end leaves of the confidence."""
+_SHORTEST_TAIL = 24
+"""Points that go on so, at least: what is shorter may be the thread's own end, in the shade."""
+_WINDOW, _STEP_POINTS = 10, 3
+"""Points whose strength counts on each side of an end, and those about it that do not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A thread in one view, from end to end."""
+
+    pixels: Float64
+    """(k, 2) about one pixel apart."""
+    doubts: tuple[Doubt, ...] = ()
+    """Where the thread may run another way."""
+
+
+@dataclass(frozen=True, eq=False)
+class Thread:
+    """Segments of one view that make a thread, from end to end."""
+
+    ridges: Ridges
+    """Of the view; segments that two strands share are doubled."""
+    entries: list[int]
+    """The end at which each segment is entered: 2i is the start of segment i, 2i + 1 its end."""
+    origin: int
+    """The segment that the seed lies on."""
+    chain: Chain
+
+    @property
+    def pieces(self) -> list[Float64]:
+        """The segments in order, each run in the direction of the thread."""
+        return [inward(self.ridges.segments, entry) for entry in self.entries]
+
+    @property
+    def others(self) -> Float64:
+        """(k, 2) pixels on the ridges of other strands, as clear as the thread's or shared with it."""
+        ridges, own = self.ridges, {e // 2 for e in self.entries}
+        level = _FAINT * float(np.median(ridges.sample(self.chain.pixels)))
+        rest = [s for k, s in enumerate(ridges.segments) if k not in own]
+        clear = [s for s in rest if np.median(ridges.sample(s)) > level]
+        return np.concatenate([np.empty((0, 2)), *clear])
+
+
+def follow_thread(
+    ridges: Ridges, origin: int, config: InitializationConfig, depth: Depth | None = None
+) -> Thread:
+    """The merged segments through segment `origin`."""
+    joints = merge_ends(ridges, config, depth)
+    ridges = replace(ridges, segments=tuple(joints.segments))
+    entries = _without_faint_ends(ridges, joints.follow(origin), origin)
+    line = _join([inward(ridges.segments, entry) for entry in entries])
+    chain = Chain(line, tuple(doubts(joints, entries, ridges)))
+    return Thread(ridges, entries, origin, chain)
+
+
+def without_faint_tails(thread: Thread, place: Float64) -> Thread:
+    """The thread through `place` (2,), cut where its strength falls at once and for good: it ends
+    there at a vein, or at another thread, that goes on in its direction."""
+    chain = thread.chain
+    strength = thread.ridges.sample(chain.pixels)
+    near = int(np.argmin(np.linalg.norm(chain.pixels - place, axis=1)))
+    stop = _falls_at(strength, near)
+    start = len(strength) - _falls_at(strength[::-1], len(strength) - 1 - near)
+    if stop - start == len(strength):
+        return thread
+    pixels = chain.pixels[start:stop]
+    left = [d for d in chain.doubts if np.linalg.norm(pixels - d.place, axis=1).min() < _WINDOW]
+    cut = [end for end, at in ((0, start), (-1, len(strength) - stop)) if at > 0]
+    left += [Doubt(pixels[end], FADES, _FAINTER) for end in cut]
+    return replace(thread, chain=Chain(pixels, tuple(left)))
+
+
+def _falls_at(strength: Float64, first: int) -> int:
+    """Where behind the point `first` a chain falls far below its strength; its length if nowhere."""
+    aside = _WINDOW + _STEP_POINTS
+    if len(strength) <= first + aside + _SHORTEST_TAIL:
+        return len(strength)
+    medians = np.median(sliding_window_view(strength, _WINDOW), axis=1)
+    places = np.arange(first + aside, len(strength) - _SHORTEST_TAIL + 1)
+    fall = medians[places + _STEP_POINTS] / np.maximum(medians[places - aside], 1e-9)
+    for k in np.argsort(fall):
+        place = int(places[k])
+        if fall[k] > _FALL:
+            break
+        if np.median(strength[place:]) < _FALLEN * np.median(strength[:place]):
+            return place
+    return len(strength)
+
+
+def _without_faint_ends(ridges: Ridges, entries: list[int], origin: int) -> list[int]:
+    """Leaves out segments at either end that are far fainter than the thread: shadows, veins."""
+    strength = {e: ridges.sample(ridges.segments[e // 2]).mean() for e in entries}
+    for _ in (0, 1):
+        while entries[-1] // 2 != origin:
+            rest = entries[:-1]
+            sizes = [len(ridges.segments[e // 2]) for e in rest]
+            level = np.average([strength[e] for e in rest], weights=sizes)
+            if strength[entries[-1]] > _FAINT * level:
+                break
+            entries = rest
+        entries = entries[::-1]
+    return entries
+
+
+def _join(pieces: list[Float64]) -> Float64:
+    """(k, 2) pixels through all pieces, straight over the gaps between them, one pixel apart."""
+    points = [pieces[0]]
+    for a, b in pairwise(pieces):
+        count = int(np.linalg.norm(b[0] - a[-1]))
+        share = np.arange(1, count)[:, None] / max(count, 1)
+        points += [a[-1] + share * (b[0] - a[-1]), b]
+    line = np.concatenate(points)
+    return resample(line, max(round(arc_lengths(line)[-1]), 1) + 1)
