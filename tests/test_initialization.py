@@ -11,11 +11,11 @@ from scipy.stats import spearmanr
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
+from suturetrack.initialization.arms import Arms
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.ends import read_end
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.segments import find_ridges, split_at_touches
-from suturetrack.initialization.strands import Strands
 from suturetrack.initialization.topology import merge_ends
 from suturetrack.metrics import curve_error, polyline_distances, polyline_length
 from suturetrack.segmentation import Segmenter
@@ -734,13 +734,13 @@ def test_strands_are_asked_of_no_copies_but_their_own(monkeypatch: pytest.Monkey
     field = paint(rig, threads, 0)
     left, right = rig.project(threads[0])
     ridges = find_ridges(field.left, InitializationConfig())
-    change = Strands.change
+    change = Arms.change
 
-    def spy(strands: Strands, *ways: list[tuple[int, int]]) -> float | None:
+    def spy(arms: Arms, *ways: list[tuple[int, int]]) -> float | None:
         asked.extend(end for way in ways for pair in way for end in pair)
-        return change(strands, *ways)
+        return change(arms, *ways)
 
-    monkeypatch.setattr(Strands, "change", spy)
+    monkeypatch.setattr(Arms, "change", spy)
     depth = Depth.around((left - right)[:, 0], field.left, field.right)
     merged = merge_ends(ridges, InitializationConfig(), depth)
     assert len(merged.segments) > len(ridges.segments)

@@ -7,9 +7,9 @@ import pytest
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import initialize
+from suturetrack.initialization.arms import Arms
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.pricing import Merge
-from suturetrack.initialization.strands import Strands
 from suturetrack.metrics import curve_error
 from suturetrack.types import Float32, Float64, Nurbs, Seed
 from tests.test_initialization import dense, draw, field_of
@@ -57,11 +57,11 @@ def test_a_step_in_depth_makes_a_merge_dearer(
     left, right = two_views(arms, [DISPARITY, *(DISPARITY + s for s in steps)], rig)
     merges = Merge(np.array([[0, 2], [0, 4]]), np.array([0.3, 0.3]), np.zeros(2, bool))
     depth = Depth.around(np.full(10, DISPARITY), left, right)
-    cost = Strands(tuple(arms), {}, merges, depth).with_depth(merges).cost
+    cost = Arms(tuple(arms), {}, merges, depth).with_depth(merges).cost
     assert cost[dearer] > cost[1 - dearer] + 0.2
     assert cost[1 - dearer] == pytest.approx(0.3, abs=0.1)
     np.testing.assert_array_equal(
-        Strands(tuple(arms), {}, merges, None).with_depth(merges).cost, merges.cost
+        Arms(tuple(arms), {}, merges, None).with_depth(merges).cost, merges.cost
     )
 
 
@@ -69,13 +69,13 @@ def test_strands_that_cross_go_straight_on() -> None:
     run = np.arange(8.0, 69.0)
     ends = [np.c_[300 + way * run, 200 + side * 0.7 * run] for way in (-1, 1) for side in (-1, 1)]
     merges = Merge(np.empty((0, 2), np.int64), np.empty(0), np.empty(0, bool))
-    strands = Strands(tuple(ends), {}, merges, None)
+    crossing_arms = Arms(tuple(ends), {}, merges, None)
     straight, touching = [(0, 6), (2, 4)], [(0, 4), (2, 6)]
-    change = strands.change(straight, touching)
+    change = crossing_arms.change(straight, touching)
     assert change is not None
     assert change > 0.2
-    assert strands.change(touching, straight) == pytest.approx(-change)
-    short = Strands(tuple(e[:5] for e in ends), {}, merges, None)
+    assert crossing_arms.change(touching, straight) == pytest.approx(-change)
+    short = Arms(tuple(e[:5] for e in ends), {}, merges, None)
     assert short.change(straight, touching) is None
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
+from suturetrack.initialization.arms import ENERGY
 from suturetrack.initialization.joints import Joints, inward
 from suturetrack.initialization.pricing import FREE_END, HIGHEST, TOUCHING_PX
 from suturetrack.initialization.segments import ARM, Ridges, chain_tangents
-from suturetrack.initialization.strands import ENERGY
 from suturetrack.types import Float64
 
 CROSSING = "an ambiguous crossing"

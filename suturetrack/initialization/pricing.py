@@ -48,7 +48,7 @@ class Merge:
 
 
 @dataclass(frozen=True, eq=False)
-class _Arms:
+class _Tips:
     """The last stretches of segments, one an end, from the end inwards."""
 
     points: Float64
@@ -57,15 +57,15 @@ class _Arms:
     """(n,) how many of the points count."""
 
     @classmethod
-    def of(cls, segments: tuple[Float64, ...], clear: int) -> _Arms:
-        """Two arms a segment, without the `clear` points at the very end."""
-        arms = [a for s in segments for a in (_arm(s, clear), _arm(s[::-1], clear))]
+    def of(cls, segments: tuple[Float64, ...], clear: int) -> _Tips:
+        """Two tips a segment, without the `clear` points at the very end."""
+        tips = [a for s in segments for a in (_tip(s, clear), _tip(s[::-1], clear))]
         length = ARM - _CLEAR
-        points = np.array([a[np.minimum(np.arange(length), len(a) - 1)] for a in arms])
-        return cls(points, np.array([len(a) for a in arms]))
+        points = np.array([a[np.minimum(np.arange(length), len(a) - 1)] for a in tips])
+        return cls(points, np.array([len(a) for a in tips]))
 
-    def __getitem__(self, ends: Int64) -> _Arms:
-        return _Arms(self.points[ends], self.count[ends])
+    def __getitem__(self, ends: Int64) -> _Tips:
+        return _Tips(self.points[ends], self.count[ends])
 
     @property
     def counts(self) -> Bool:
@@ -82,45 +82,45 @@ class _Arms:
 def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
     """Prices every pair of ends within reach: whether one smooth curve runs through both segments,
     over ridge, at one strength."""
-    arms = _Arms.of(ridges.segments, _CLEAR)
-    near = arms.strength(ridges)
+    tips = _Tips.of(ridges.segments, _CLEAR)
+    near = tips.strength(ridges)
     # A highlight at a junction fades one arm of a segment, and not the segment.
     whole = np.repeat([np.median(ridges.sample(s)) for s in ridges.segments], 2)
     short = np.repeat([max(1 - len(s) / ARM, 0.0) for s in ridges.segments], 2)
-    positions = arms.points[:, 0]
+    positions = tips.points[:, 0]
     pairs = cKDTree(positions).query_pairs(2 * config.gap_px, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
     i, j = pairs.T
     distance = np.linalg.norm(positions[j] - positions[i], axis=1)
-    shape, weakest = _bridge_prices(arms, pairs, ridges, config)
+    shape, weakest = _bridge_prices(tips, pairs, ridges, config)
     hooked = np.flatnonzero((shape > FREE_END) & (distance < 2 * TOUCHING_PX))
-    others, _ = _bridge_prices(_Arms.of(ridges.segments, _HOOKED), pairs[hooked], ridges, config)
+    others, _ = _bridge_prices(_Tips.of(ridges.segments, _HOOKED), pairs[hooked], ridges, config)
     shape[hooked] = np.minimum(shape[hooked], others)
     ratio = np.minimum(*(abs(np.log(s[i] / s[j])) for s in (near, whole)))
     cost = shape + 0.25 * ratio**2 + _SHORT * np.maximum(short[i], short[j])
     return Merge(pairs, cost, (distance < TOUCHING_PX) & (weakest >= config.low))
 
 
-def _arm(segment: Float64, clear: int) -> Float64:
+def _tip(segment: Float64, clear: int) -> Float64:
     first = min(clear, len(segment) // 4)
-    arm = segment[first : first + ARM - _CLEAR]
+    tip = segment[first : first + ARM - _CLEAR]
     is_loop = np.linalg.norm(segment[-1] - segment[0]) < _CLOSED * len(segment)
-    return arm[: max(len(segment) // 4, 3)] if is_loop else arm
+    return tip[: max(len(segment) // 4, 3)] if is_loop else tip
 
 
 def _bridge_prices(
-    arms: _Arms, pairs: Int64, ridges: Ridges, config: InitializationConfig
+    tips: _Tips, pairs: Int64, ridges: Ridges, config: InitializationConfig
 ) -> tuple[Float64, Float64]:
-    """What smooth curves through (m, 2) pairs of arms cost by their shape and the ridge below them,
-    and the least ||V|| between the arms, each (m,)."""
+    """What smooth curves through (m, 2) pairs of tips cost by their shape and the ridge below them,
+    and the least ||V|| between the tips, each (m,)."""
     parts = np.array_split(pairs, len(pairs) // _AT_ONCE + 1)
-    found = [_bridge_price(arms[p[:, 0]], arms[p[:, 1]], ridges, config) for p in parts]
+    found = [_bridge_price(tips[p[:, 0]], tips[p[:, 1]], ridges, config) for p in parts]
     price, weakest = zip(*found, strict=True)
     return np.concatenate(price), np.concatenate(weakest)
 
 
 def _bridge_price(
-    one: _Arms, other: _Arms, ridges: Ridges, config: InitializationConfig
+    one: _Tips, other: _Tips, ridges: Ridges, config: InitializationConfig
 ) -> tuple[Float64, Float64]:
     misfit, swing, bridge = _common_curves(one, other)
     distance = np.linalg.norm(other.points[:, 0] - one.points[:, 0], axis=1)
@@ -129,9 +129,9 @@ def _bridge_price(
     return misfit + _SWING * swing**2 + missing + 0.1 * distance / config.gap_px, weakest
 
 
-def _common_curves(one: _Arms, other: _Arms) -> tuple[Float64, Float64, Float64]:
-    """Cubics through both of m pairs of arms: their mean squared misfits, px^2, by how many radians
-    per length their curvatures change over them, and (m, k, 2) the cubics between the arms."""
+def _common_curves(one: _Tips, other: _Tips) -> tuple[Float64, Float64, Float64]:
+    """Cubics through both of m pairs of tips: their mean squared misfits, px^2, by how many radians
+    per length their curvatures change over them, and (m, k, 2) the cubics between the tips."""
     distance = np.linalg.norm(other.points[:, 0] - one.points[:, 0], axis=1)
     steps = np.arange(one.points.shape[1], dtype=float)
     t = np.c_[np.tile(-steps, (len(distance), 1)), distance[:, None] + steps]

@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
+from suturetrack.initialization.arms import REACH, Arms
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.hairpins import double_stubs
 from suturetrack.initialization.joints import Joints, Pair, inward
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.pricing import FREE_END, HIGHEST, Merge, price_merges
 from suturetrack.initialization.segments import ARM, Ridges
-from suturetrack.initialization.strands import REACH, Strands
 
 _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""
@@ -39,42 +39,42 @@ def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None
         return Joints([], {})
     merges = price_merges(ridges, config)
     first = _merge(ridges, merges, None)
-    strands = Strands(first.segments, first.partner, merges, depth)
-    return _merge(ridges, strands.with_depth(merges), strands)
+    arms = Arms(first.segments, first.partner, merges, depth)
+    return _merge(ridges, arms.with_depth(merges), arms)
 
 
-def _merge(ridges: Ridges, merges: Merge, strands: Strands | None) -> Joints:
+def _merge(ridges: Ridges, merges: Merge, arms: Arms | None) -> Joints:
     joints = Joints.priced(ridges.segments, merges)
     order = np.argsort(merges.cost)
     joints.join_free(merges.pairs[order[merges.cost[order] < HIGHEST]])
     joints.exchange()
-    if strands is not None:
-        _uncross(joints, strands)
-    _share(joints, strands)
+    if arms is not None:
+        _uncross(joints, arms)
+    _share(joints, arms)
     joints.open_rings()
     double_stubs(joints)
     joints.join_free(merges.pairs[order[merges.touching[order]]])
-    if strands is not None:
-        _mark_bent(joints, strands)
-        _bridge_hidden(joints, ridges, strands)
-        _lead_beside(joints, strands.pieces)
+    if arms is not None:
+        _mark_bent(joints, arms)
+        _bridge_hidden(joints, ridges, arms)
+        _lead_beside(joints, arms.pieces)
     return joints
 
 
-def _mark_bent(joints: Joints, strands: Strands) -> None:
+def _mark_bent(joints: Joints, arms: Arms) -> None:
     joints.bent = frozenset(
         i
         for i, j in joints.partner.items()
-        if strands.bend(joints.original(i), joints.original(j)) > _BENT
+        if arms.bend(joints.original(i), joints.original(j)) > _BENT
     )
 
 
-def _bridge_hidden(joints: Joints, ridges: Ridges, strands: Strands) -> None:
+def _bridge_hidden(joints: Joints, ridges: Ridges, arms: Arms) -> None:
     """Joins free ends of one strand that something, such as a tool, hides in between."""
     free = [end for end in joints.free if end < 2 * len(ridges.segments)]
     if len(free) < 2:
         return
-    ways = [(strands.goes_on(i, j), i, j) for i, j in _facing(free, ridges)]
+    ways = [(arms.goes_on(i, j), i, j) for i, j in _facing(free, ridges)]
     for energy, i, j in sorted(ways):
         if energy > _ONE_STRAND:
             break
@@ -101,7 +101,7 @@ def _facing(ends: list[int], ridges: Ridges) -> list[Pair]:
     return [(ends[i], ends[j]) for i, j in zip(a[is_pair], b[is_pair], strict=True)]
 
 
-def _uncross(joints: Joints, strands: Strands) -> None:
+def _uncross(joints: Joints, arms: Arms) -> None:
     """Where one strand leads through a short segment and another beside it, swaps their far parts if
     these fit better so: short segments say little about direction."""
     within, partner, price = joints.within_reach(), joints.partner, joints.price
@@ -114,7 +114,7 @@ def _uncross(joints: Joints, strands: Strands) -> None:
             d = partner.get(c, -1)
             if c in (a, b) or d in (a, b, start, stop) or d not in within.get(stop, ()):
                 continue
-            change = strands.change([(a, b), (c, d)], [(a, d), (c, b)])
+            change = arms.change([(a, b), (c, d)], [(a, d), (c, b)])
             if change is None:
                 continue
             ways = [
@@ -128,7 +128,7 @@ def _uncross(joints: Joints, strands: Strands) -> None:
                 break
 
 
-def _share(joints: Joints, strands: Strands | None) -> None:
+def _share(joints: Joints, arms: Arms | None) -> None:
     """Doubles the runs of segments that a second strand waits for at both ends."""
     partner = joints.partner
     waiting: dict[int, tuple[float, int]] = {}
@@ -144,7 +144,7 @@ def _share(joints: Joints, strands: Strands | None) -> None:
         if any(e // 2 in taken for e in run):
             continue
         taken.update(e // 2 for e in run)
-        _double(joints, run, one, other, strands)
+        _double(joints, run, one, other, arms)
 
 
 def _runs(waiting: dict[int, tuple[float, int]], partner: dict[int, int]) -> list[list[int]]:
@@ -162,9 +162,9 @@ def _runs(waiting: dict[int, tuple[float, int]], partner: dict[int, int]) -> lis
     return runs
 
 
-def _double(joints: Joints, run: list[int], one: int, other: int, strands: Strands | None) -> None:
+def _double(joints: Joints, run: list[int], one: int, other: int, arms: Arms | None) -> None:
     """Leads a second strand, which waits with the ends `one` and `other`, through a run; its lead is by
-    how much that costs less than the other way, as far as the strands tell."""
+    how much that costs less than the other way, as far as the arms tell."""
     start, stop = run[0], run[-1] ^ 1
     first, last = joints.partner[start], joints.partner[stop]
     # Of the two ways to connect the strands none may close a loop; else the smoother one is taken.
@@ -173,7 +173,7 @@ def _double(joints: Joints, run: list[int], one: int, other: int, strands: Stran
         is_crossed = is_ring
     else:
         straight, crossed = [(one, other), (first, last)], [(one, last), (first, other)]
-        change = None if strands is None else _change(joints, straight, crossed, strands)
+        change = None if arms is None else _change(joints, straight, crossed, arms)
         if change is None:
             change = sum(map(joints.price_of, crossed)) - sum(map(joints.price_of, straight))
         else:
@@ -192,18 +192,16 @@ def _double(joints: Joints, run: list[int], one: int, other: int, strands: Stran
         joints.join(stop, other)
 
 
-def _change(
-    joints: Joints, taken: list[Pair], exchanged: list[Pair], strands: Strands
-) -> float | None:
+def _change(joints: Joints, taken: list[Pair], exchanged: list[Pair], arms: Arms) -> float | None:
     """How much dearer the ends of two strands are joined as `exchanged`; None where it is not told."""
-    # Strands know of no copies but their own.
+    # The arms know of no copies but their own.
     ways = (
         [(joints.original(i), joints.original(j)) for i, j in way] for way in (taken, exchanged)
     )
-    return strands.change(*ways)
+    return arms.change(*ways)
 
 
-def _lead_beside(joints: Joints, pieces: Strands) -> None:
+def _lead_beside(joints: Joints, pieces: Arms) -> None:
     """The leads of strands that pass beside a short segment of another strand, which they touch."""
     within, lead = joints.within_reach(), dict[int, float]()
     for a, b in joints.partner.items():

@@ -37,7 +37,7 @@ _ANYWHERE_PX = 100.0
 _ANY_CURVATURE = 0.05
 
 
-class Strands:
+class Arms:
     """The arms of one view's segments, from each end inwards."""
 
     def __init__(
@@ -53,9 +53,9 @@ class Strands:
         self._disparities: dict[int, Disparities | None] = {}
 
     @cached_property
-    def pieces(self) -> Strands:
+    def pieces(self) -> Arms:
         """The arms as far as the segments go by themselves, whoever may share them."""
-        return Strands(self._segments, {}, None, self._depth)
+        return Arms(self._segments, {}, None, self._depth)
 
     def with_depth(self, merges: Merge) -> Merge:
         """The merges, those dearer whose arms differ in depth."""
