@@ -55,7 +55,7 @@ def read_end(field: Float32, pixels: Float64) -> EndReading:
     below = np.flatnonzero((response < level) & (later < level) & (x > -_INSIDE_PX + 4))
     if level <= 0 or len(below) == 0:
         return EndReading(np.nan, _leaves(pixels[0] + _OUTSIDE_PX * outward, field))
-    offset = falls_below(x, response, int(below[0]), level)
+    offset = _falls_below(x, response, int(below[0]), level)
     narrow = response * narrowness(field, places, tangents, x)
     offset = before_a_hole(x, narrow, level, offset)
     if _leaves(pixels[0] + offset * outward, field):
@@ -91,11 +91,11 @@ def before_a_hole(x: Float64, narrow: Float64, level: float, end: float) -> floa
     shown = np.flatnonzero(narrow >= level)
     if len(shown) == 0 or shown[-1] + 1 == len(x):
         return end
-    hole = falls_below(x, narrow, int(shown[-1]) + 1, level)
+    hole = _falls_below(x, narrow, int(shown[-1]) + 1, level)
     return hole if end - _HOLE_PX <= hole < end else end
 
 
-def falls_below(x: Float64, response: Float64, k: int, level: float) -> float:
+def _falls_below(x: Float64, response: Float64, k: int, level: float) -> float:
     """Where the response falls to the level, just before the place `k` of an even `x`."""
     drop = max(float(response[k - 1] - response[k]), 1e-9)
     return float(x[k] - (x[1] - x[0]) * (level - response[k]) / drop)

@@ -25,6 +25,8 @@ _GLANCING = 0.3
 """Cosine of the angle below which an end runs into the side of a segment rather than along it."""
 _HEADING = 6
 """Points at an end that tell where it runs into another segment."""
+_CHORD = 3
+"""Points to both sides of one at which the tangent is that of the chord."""
 _KINK_REACH = 5
 _KINK = 0.6
 """Cosine of the turn, over `_KINK_REACH` points to both sides, from which a segment has a kink."""
@@ -220,10 +222,10 @@ def _apart(cuts: list[int]) -> list[int]:
     return [c for i, c in enumerate(cuts) if i == 0 or c - cuts[i - 1] > _NEAR_PX]
 
 
-def chain_tangents(pixels: Float64, reach: int = 3) -> Float64:
+def chain_tangents(pixels: Float64) -> Float64:
     """(k, 2) unit tangents of a chain with points one pixel apart."""
-    ahead = pixels[np.minimum(np.arange(len(pixels)) + reach, len(pixels) - 1)]
-    behind = pixels[np.maximum(np.arange(len(pixels)) - reach, 0)]
+    ahead = pixels[np.minimum(np.arange(len(pixels)) + _CHORD, len(pixels) - 1)]
+    behind = pixels[np.maximum(np.arange(len(pixels)) - _CHORD, 0)]
     t = ahead - behind
     return t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-9)
 
