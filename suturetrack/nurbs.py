@@ -1,4 +1,4 @@
-"""NURBS curves (Section IV): basis, evaluation, knots in and out, least-squares fit.
+"""NURBS curves (Section IV): basis, evaluation, knots, parts, least-squares fit.
 
 The basis itself is SciPy's; all curves have clamped knots over [0, 1]. Curves made here have unit
 weights, for which a NURBS curve is a B-spline and its projection stays linear in the control points;
@@ -119,19 +119,6 @@ def bending_matrix(knots: Float64, degree: int) -> Float64:
     count = len(knots) - degree - 1
     second = np.asarray(BSpline(knots, np.eye(count), degree)(s, 2))
     return second.T @ ((weights * half).ravel()[:, None] * second)
-
-
-def remove_knot(curve: Nurbs, index: int) -> Nurbs:
-    """The closest curve without the interior knot `index`; its ends stay where they are."""
-    knots = np.delete(curve.knots, index)
-    s = np.linspace(0, 1, 8 * len(curve.control_points))
-    points = evaluate(curve, s)
-    a = basis(s, knots, curve.degree)
-    ends = a[:, [0, -1]] @ curve.control_points[[0, -1]]
-    inner, *_ = np.linalg.lstsq(a[:, 1:-1], points - ends, rcond=None)
-    return curve_from(
-        curve.degree, knots, np.r_[curve.control_points[:1], inner, curve.control_points[-1:]]
-    )
 
 
 def reversed_curve(curve: Nurbs) -> Nurbs:

@@ -57,15 +57,6 @@ def test_inserting_a_knot_keeps_the_shape(curve: Nurbs, s: float) -> None:
     assert np.allclose(nurbs.evaluate(finer, S), nurbs.evaluate(curve, S), atol=1e-9)
 
 
-@given(curves(), st.floats(0.05, 0.95))
-def test_removing_an_inserted_knot_restores_the_shape(curve: Nurbs, s: float) -> None:
-    finer = nurbs.insert_knot(curve, s)
-    index = int(np.searchsorted(finer.knots, s))
-    restored = nurbs.remove_knot(finer, index)
-    assert len(restored.control_points) == len(curve.control_points)
-    assert np.allclose(nurbs.evaluate(restored, S), nurbs.evaluate(curve, S), atol=1e-5)
-
-
 @given(curves(), st.floats(0.0, 0.4), st.floats(0.6, 1.0))
 def test_a_part_is_that_part(curve: Nurbs, start: float, stop: float) -> None:
     piece = nurbs.part(curve, start, stop)
@@ -102,7 +93,7 @@ def test_it_agrees_with_geomdl(curve: Nurbs) -> None:
     assert np.allclose(nurbs.evaluate(rational, S), other.evaluate_list(S.tolist()), atol=1e-9)
 
 
-def test_insertion_agrees_with_geomdl_and_removal_undoes_it(curve: Nurbs) -> None:
+def test_insertion_agrees_with_geomdl(curve: Nurbs) -> None:
     other = GeomdlBSpline.Curve()
     other.degree = curve.degree
     other.ctrlpts = curve.control_points.tolist()
@@ -111,9 +102,6 @@ def test_insertion_agrees_with_geomdl_and_removal_undoes_it(curve: Nurbs) -> Non
     ours = nurbs.insert_knot(curve, 0.4)
     assert np.allclose(ours.knots, other.knotvector)
     assert np.allclose(ours.control_points, other.ctrlpts)
-    # geomdl's own removal of this knot is 2.8 away from the curve, so it is no oracle for ours.
-    restored = nurbs.remove_knot(ours, other.knotvector.index(0.4))
-    assert np.allclose(restored.control_points, curve.control_points, atol=1e-9)
 
 
 def test_length_of_a_straight_line_and_of_an_arc() -> None:
