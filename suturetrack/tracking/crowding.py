@@ -72,7 +72,7 @@ def _beside(
     """(k,) samples, of so many px each, beside which another thread or an unknown ridge runs."""
     known = search.doubled(own.arrays, others.arrays, SAME_STRAND_PX, _NEAR_PX)
     itself = search.doubled(own.arrays, own.arrays, SAME_STRAND_PX, _GRID_PX[-1])
-    profiles = search.normal_profiles(image, view.pixels, view.tangents, _GRID_PX, 0.0)
+    profiles = view.profiles(image, _GRID_PX)
     inner = profiles[:, 1:-1]
     summits = (inner > profiles[:, :-2]) & (inner >= profiles[:, 2:]) & (inner > _CLEAR * level)
     several = search.solid((summits.sum(axis=1) > 1) & ~itself, lengths, _SHORTEST_PX)

@@ -11,7 +11,6 @@ from scipy.ndimage import uniform_filter1d
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.ends import before_a_hole, narrowness
-from suturetrack.kernels import search
 from suturetrack.kernels.boundary import outer_boundary
 from suturetrack.tracking.sampling import View, derivatives_at, distinct, views, views_at
 from suturetrack.types import Float64, Nurbs, RidgeField
@@ -126,7 +125,7 @@ def _profiles(
     x = np.arange(-min(_INWARD_PX, 0.5 * scale), _OUTWARD_PX + 0.1, _STEP_PX)
     both = views(rig, *_extension(curve, end, np.asarray(x / scale, np.float64)))
     responses = [
-        np.minimum(search.responses(image, view.pixels, view.tangents) / level, 1.2)
+        np.minimum(view.responses(image) / level, 1.2)
         for image, view, level in zip((field.left, field.right), both, levels, strict=True)
     ]
     return x, both, responses

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import search
-from suturetrack.tracking.sampling import Samples, View, views
-from suturetrack.types import Energies, Float32, Float64, Nurbs, RidgeField
+from suturetrack.tracking.sampling import Samples, views
+from suturetrack.types import Energies, Float64, Nurbs, RidgeField
 
 
 def energies(
@@ -21,7 +20,7 @@ def energies(
     samples = Samples.of(curve.knots, 5)
     points, first, second = (samples.values(curve.control_points, d) for d in range(3))
     images = [
-        -float(np.sum(samples.share * _response(image, view)))
+        -float(np.sum(samples.share * view.responses(image)))
         for image, view in zip((field.left, field.right), views(rig, points, first), strict=True)
     ]
     return Energies(
@@ -34,7 +33,7 @@ def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[flo
     samples = Samples.of(curve.knots, 5)
     both = samples.views(rig, curve.control_points)
     left, right = (
-        float(np.median(_response(image, view)))
+        float(np.median(view.responses(image)))
         for image, view in zip((field.left, field.right), both, strict=True)
     )
     return max(left, 0.05), max(right, 0.05)
@@ -44,13 +43,9 @@ def _end(curve: Nurbs, field: RidgeField, rig: StereoRig, cutoffs: tuple[float, 
     ends = Samples.at(curve.knots, np.array([0.0, 1.0]))
     both = ends.views(rig, curve.control_points)
     return sum(
-        float(np.sum((_response(image, view) - cutoff) ** 2))
+        float(np.sum((view.responses(image) - cutoff) ** 2))
         for image, view, cutoff in zip((field.left, field.right), both, cutoffs, strict=True)
     )
-
-
-def _response(image: Float32, view: View) -> Float64:
-    return search.responses(image, view.pixels, view.tangents)
 
 
 def _bending(first: Float64, second: Float64, samples: Samples) -> float:

@@ -31,7 +31,7 @@ from suturetrack.tracking.reliability import (
     judge,
     loose_ends,
 )
-from suturetrack.tracking.sampling import length_of, values_at, views_at
+from suturetrack.tracking.sampling import length_of, resampled, values_at, views_at
 from suturetrack.tracking.spacing import respace
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
 from suturetrack.types import Bool, Nurbs, RidgeField, Status, ThreadState
@@ -126,7 +126,7 @@ class Follower:
         curve = model.motion.predict(model.curve, (capture_ns - model.capture_ns) * _NS)
         s = np.linspace(0, 1, _CLAIMS)
         both = views_at(self.rig, curve, s)
-        seen = np.interp(s, np.linspace(0, 1, len(self._seen)), self._seen) > 0.5
+        seen = resampled(self._seen, s)
         return Strand.other(both[0], seen), Strand.other(both[1], seen)
 
     def step(self, field: RidgeField, thread: str, neighbours: Neighbours = NOBODY) -> ThreadState:

@@ -95,13 +95,13 @@ def _point_offsets(
 
 def _normal_offsets(image: Float32, view: View, config: PaperConfig) -> Float64:
     """(k,) px along the normals: eqs. (5) and (6); where the field is flat, active search."""
-    response = search.responses(image, view.pixels, view.tangents)
+    response = view.responses(image)
     magnitude = search.magnitudes(image, view.pixels)
     slope = _slope(image, view.pixels, view.normals)
     force = config.gain * slope * response / np.maximum(magnitude, 1e-6)
     reach = round(config.search_px / _SEARCH_STEP_PX)
-    grid = _SEARCH_STEP_PX * np.arange(-reach, reach + 1)
-    profiles = search.normal_profiles(image, view.pixels, view.tangents, grid, 0.0)
+    grid = _SEARCH_STEP_PX * np.arange(-reach, reach + 1, dtype=np.float64)
+    profiles = view.profiles(image, grid)
     best = np.argmax(profiles - 1e-3 * np.abs(grid), axis=1)
     flat = (np.abs(force) < config.flat_px) & (profiles.max(axis=1) > response + _CLEARER)
     searched = np.clip(grid[best], -config.largest_step_px, config.largest_step_px)

@@ -88,12 +88,7 @@ def starts_on(last: Nurbs, seed: Seed, field: RidgeField, rig: StereoRig) -> lis
     s = np.linspace(0.03, 0.97, _PLACES)
     points = evaluate(last, s)
     both = views(rig, points, tangents(last, s))
-    shown = np.minimum(
-        *(
-            search.responses(image, view.pixels, view.tangents)
-            for image, view in zip((field.left, field.right), both, strict=True)
-        )
-    )
+    shown = np.minimum(both[0].responses(field.left), both[1].responses(field.right))
     best = np.argsort(-shown)
     far = best[np.abs(best - best[0]) > _PLACES // 4]
     chosen = [best[0], *far[: _SEEDS - 1]]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import spline
-from suturetrack.types import Bool, Float64, Int64, Nurbs
+from suturetrack.kernels import search, spline
+from suturetrack.types import Bool, Float32, Float64, Int64, Nurbs
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +62,14 @@ class View:
         """(k, 2) unit normals, the tangents turned by +90 degrees."""
         return np.stack([-self.tangents[:, 1], self.tangents[:, 0]], axis=1)
 
+    def responses(self, image: Float32) -> Float64:
+        """(k,) responses of an (H, W, 2) field, eq. (4)'s integrand."""
+        return search.responses(image, self.pixels, self.tangents)
+
+    def profiles(self, image: Float32, offsets: Float64) -> Float64:
+        """(k, m) the same at the m offsets along the normals, px."""
+        return search.normal_profiles(image, self.pixels, self.tangents, offsets, 0.0)
+
     def inside(self, image_size: tuple[int, int], margin: float = 1.0) -> Bool:
         """(k,) whether the samples lie inside the image."""
         u, v = self.pixels.T
@@ -99,6 +107,11 @@ def derivatives_at(curve: Nurbs, s: Float64) -> Float64:
 def length_of(curve: Nurbs) -> float:
     """Arc length of a cubic curve, by quadrature on each knot span."""
     return float(spline.arc_length(curve.knots, curve.control_points))
+
+
+def resampled(flags: Bool, s: Float64) -> Bool:
+    """(k,) at parameters in [0, 1], what is told at evenly spaced ones."""
+    return np.interp(s, np.linspace(0, 1, len(flags)), flags) > 0.5
 
 
 def distinct(knots: Float64) -> Float64:

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import search
 from suturetrack.metrics import polyline_length
-from suturetrack.tracking.sampling import View, views_at
+from suturetrack.tracking.sampling import View, resampled, views_at
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.types import Bool, Float32, Float64, Image, Nurbs, RidgeField
 
@@ -75,7 +74,7 @@ class Strangers:
         past = tuple(then for then in self._past if 0 <= now - then[0] < _REMEMBERED_NS)
         s = np.linspace(0, 1, _PLACES)
         both = views_at(rig, curve, s)
-        shown = np.interp(s, np.linspace(0, 1, len(seen)), seen) > 0.5
+        shown = resampled(seen, s)
         branches: list[Bool] = []
         ridges = []
         for side, (image, view) in enumerate(zip((field.left, field.right), both, strict=True)):
@@ -113,8 +112,7 @@ def _around(pixels: Float64, shape: tuple[int, ...], margin: float) -> tuple[sli
 def _half_width(image: Float32, view: View, level: float) -> float:
     """How far from its middle the thread's ridge reaches, px."""
     offsets: Float64 = np.arange(_WIDEST_PX + 1.0)
-    profiles = search.normal_profiles(image, view.pixels, view.tangents, offsets, 0.0)
-    profile = np.median(profiles, axis=0)
+    profile = np.median(view.profiles(image, offsets), axis=0)
     return float(np.argmax(profile < _NOTHING * level))
 
 
