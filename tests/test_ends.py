@@ -8,7 +8,8 @@ from suturetrack.camera import StereoRig
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
-from suturetrack.tracking.ends import EndStep, EndWatch, end_shift, find_end
+from suturetrack.tracking.end_watch import EndWatch
+from suturetrack.tracking.ends import EndStep, end_shift, find_end
 from suturetrack.tracking.energies import measure_levels
 from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.length import KnownLength

@@ -14,9 +14,10 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, initialize
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.control_points import rearrange, refit
+from suturetrack.tracking.drift import Drift
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.gauss_newton import expected
-from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Doubt, Evidence
+from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Evidence
 from suturetrack.tracking.sampling import Samples
 from suturetrack.types import Nurbs, RidgeField, Seed, Status, ThreadState
 from tests.conftest import make_rig
@@ -586,37 +587,37 @@ def test_what_moves_outside_the_images_is_gone_until_it_comes_in(rig: StereoRig)
     pixels = np.stack(rig.project(nurbs.evaluate(swung_out(0.0), s)))
     seen = np.all(pixels[..., 0] < 628, axis=0)
     assert 0.5 < seen.mean() < 0.9
-    doubt = Doubt()
+    drift = Drift()
     for i in range(40):
         before, after = swung_out(5.0 * i), swung_out(5.0 * (i + 1))
-        doubt.grow(before, after, after, seen, rig)
-        assert doubt.gone[-1] == (doubt.px[-1] > 8.0)
-    assert not doubt.px[seen].any()
-    assert doubt.gone[-5:].all()
-    assert not doubt.gone[seen].any()
-    assert not doubt.anywhere[-5:].any()
-    doubt.cut(0, 0)
-    assert doubt.gone[-5:].all()
+        drift.grow(before, after, after, seen, rig)
+        assert drift.gone[-1] == (drift.px[-1] > 8.0)
+    assert not drift.px[seen].any()
+    assert drift.gone[-5:].all()
+    assert not drift.gone[seen].any()
+    assert not drift.anywhere[-5:].any()
+    drift.cut(0, 0)
+    assert drift.gone[-5:].all()
     at_rest = swung_out(0.0)
     inside = replace(at_rest, control_points=at_rest.control_points - [60.0, 0.0, 0.0])
-    doubt.grow(inside, inside, inside, seen, rig)
-    assert not (doubt.gone | doubt.anywhere).any()
+    drift.grow(inside, inside, inside, seen, rig)
+    assert not (drift.gone | drift.anywhere).any()
 
 
 def test_a_hidden_end_is_where_it_was_on_a_thread_that_jumps_as_a_whole(rig: StereoRig) -> None:
     points = np.stack([np.linspace(-60, 60, 8), np.zeros(8), np.full(8, 300.0)], axis=1)
     knots = nurbs.clamped_knots(np.linspace(0, 1, 6)[1:-1], 3)
     seen = np.arange(RELIABILITY_SAMPLES) < 0.8 * RELIABILITY_SAMPLES
-    doubt = Doubt()
+    drift = Drift()
     for i in range(20):
         here, there = (
             nurbs.curve_from(3, knots, points + np.array([0.0, shift, 0.0]))
             for shift in (0.0, 0.5 * (-1) ** i)
         )
-        doubt.grow(here, here, there, seen, rig)
-    assert not doubt.px[seen].any()
-    assert 0.5 < doubt.px[-1] < 5.0
-    assert not doubt.anywhere.any()
+        drift.grow(here, here, there, seen, rig)
+    assert not drift.px[seen].any()
+    assert 0.5 < drift.px[-1] < 5.0
+    assert not drift.anywhere.any()
 
 
 def test_two_threads_keep_their_names(rig: StereoRig) -> None:

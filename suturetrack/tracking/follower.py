@@ -14,7 +14,9 @@ from suturetrack.tracking.alignment import shifted, shown
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange
 from suturetrack.tracking.crowding import covered
-from suturetrack.tracking.ends import EndStep, EndWatch, find_end, with_ends
+from suturetrack.tracking.drift import Drift, HiddenEnds
+from suturetrack.tracking.end_watch import EndWatch
+from suturetrack.tracking.ends import EndStep, find_end, with_ends
 from suturetrack.tracking.energies import energies, measure_levels
 from suturetrack.tracking.fitting import fit_widely
 from suturetrack.tracking.folds import doubled_ends
@@ -25,9 +27,7 @@ from suturetrack.tracking.regrowth import regrown, unseen_tails
 from suturetrack.tracking.reliability import (
     ASTRAY,
     RELIABILITY_SAMPLES,
-    Doubt,
     Evidence,
-    HiddenEnds,
     judge,
     loose_ends,
 )
@@ -86,7 +86,7 @@ class Follower:
         self._lost = False
         self._certain_ns = now
         self._doubted_ns = self._regrown_ns = -(1 << 62)
-        self._doubt = Doubt()
+        self._drift = Drift()
         self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
         self._share = 1.0
@@ -145,7 +145,7 @@ class Follower:
                 field, predicted, neighbours
             )
             self._learn_motion(before, evidence, seconds)
-        self._doubt.grow(before, predicted, model.curve, evidence.evenly_seen, self.rig)
+        self._drift.grow(before, predicted, model.curve, evidence.evenly_seen, self.rig)
         for further, more, fewer in self._follow_into_sight(field, neighbours):
             evidence, inserted, removed = further, inserted + more, removed + fewer
         if self.config.method != "paper":
@@ -163,8 +163,8 @@ class Follower:
 
     def _judge(self, evidence: Evidence, astray: Bool, plain: Bool, seconds: float) -> Status:
         """The status, and what follows from it for the next field."""
-        model, doubt = self.model, self._doubt
-        self._hidden.step(evidence.evenly_hidden & ~doubt.outside, model.capture_ns)
+        model, drift = self.model, self._drift
+        self._hidden.step(evidence.evenly_hidden & ~drift.outside, model.capture_ns)
         wrong, uncertain_s = self._wrong(evidence, astray, plain, seconds)
         status = self._status(evidence, plain, uncertain_s)
         self._lost = status is Status.LOST
@@ -176,7 +176,7 @@ class Follower:
             self._start_again()
         elif self.config.method != "paper":
             if uncertain_s > _PATIENCE_S:
-                self._trim(wrong | doubt.hopeless)
+                self._trim(wrong | drift.hopeless)
             elif not self._lost and evidence.share >= _SOME:
                 self._give_up_hidden_ends()
         return status
@@ -194,7 +194,7 @@ class Follower:
         if plain.mean() >= 1 - ASTRAY and ends.settled and known.is_cut:
             known = known.given_up(min(known.now, ends.length))
         wrong = astray | (~plain & overlong)
-        is_certain = (wrong | self._doubt.anywhere).mean() <= ASTRAY
+        is_certain = (wrong | self._drift.anywhere).mean() <= ASTRAY
         is_certain &= not (overlong or known.is_short(length))
         has_ends = bool(plain[[0, 1, -2, -1]].all())
         if is_certain and is_whole and has_ends and not (self._lost or known.is_cut):
@@ -217,7 +217,7 @@ class Follower:
         if self._lost and (is_another or plain.mean() < 1 - ASTRAY):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
-        is_vague = self._doubt.gone.mean() > ASTRAY
+        is_vague = self._drift.gone.mean() > ASTRAY
         is_vague |= any(self._hidden.for_longer_than(_HIDDEN_S))
         is_vague |= bool(self._leaps.any()) and not known.is_reached(length)
         is_vague |= bool(np.sqrt(np.mean(evidence.sigma**2)) > _VAGUE * length)
@@ -245,7 +245,7 @@ class Follower:
         """Takes so many samples off the ends."""
         last = RELIABILITY_SAMPLES - 1
         self.model.curve = nurbs.part(self.model.curve, start / last, 1 - stop / last)
-        self._doubt.cut(start, stop)
+        self._drift.cut(start, stop)
 
     def _start_again(self) -> None:
         """Looks from where the thread was last held, from the next field on."""
@@ -266,7 +266,7 @@ class Follower:
         if of_whole > of_rest + _MORE * self.known_length.now:
             self.last_good = whole
             self._start_again()
-            self._doubt = Doubt.everywhere()
+            self._drift = Drift.everywhere()
 
     def _follow_by_forces(
         self, field: RidgeField, neighbours: Neighbours
@@ -328,7 +328,7 @@ class Follower:
             if not (self._leaps.any() and (self._comes_in or may_be_longer)):
                 return
             step = self._follow_by_least_squares(field, before, neighbours)
-            self._doubt.grow(before, before, model.curve, step[0].evenly_seen, self.rig)
+            self._drift.grow(before, before, model.curve, step[0].evenly_seen, self.rig)
             yield step
 
     def _grow_ends_anew(
@@ -426,7 +426,7 @@ class Follower:
             curve=model.curve,
             length=length_of(model.curve),
             energies=energies(model.curve, field, self.rig, cutoffs),
-            sigma=np.hypot(sigma, self._doubt.px * depth / self.rig.focal),
+            sigma=np.hypot(sigma, self._drift.px * depth / self.rig.focal),
             seen=evidence.evenly_seen,
             events=tuple(events),
         )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from suturetrack.nurbs import length as length_of
-from suturetrack.tracking.ends import EndWatch
+from suturetrack import nurbs
+from suturetrack.tracking.end_watch import EndWatch
 from suturetrack.types import Nurbs
 
 # A thread of which something is hidden has not grown by more.
@@ -114,5 +114,5 @@ def has_length(curve: Nurbs, known_lengths: tuple[float, ...]) -> bool:
 
 def length_error(curve: Nurbs, known_lengths: tuple[float, ...]) -> float:
     """How far the curve's length is from the nearest known one, as a share of that."""
-    actual = length_of(curve)
+    actual = nurbs.length(curve)
     return min(abs(actual / known - 1) for known in known_lengths)
