@@ -82,20 +82,7 @@ class EndWatch:
         doubted = self._doubted(steps, offsets, length, now_ns)
         seen = [end not in doubted for end in (0, 1)]
         for end in doubted:
-            lacking = self.length / length - 1.0 - offsets[1 - end]
-            step = steps[end]
-            bound = 0.0 if step is None else _DRAWN_PX * step.pixel
-            if step is not None and not step.alone:
-                offsets[end] = max(min(max(step.offset, 0.0), lacking), -bound)
-            elif len(doubted) == 2:
-                offsets[end] = 0.0
-            else:
-                offsets[end] = min(max(lacking, -bound), bound)
-                if step is not None and step.offset_px > 0:
-                    # What is too long lies elsewhere, but for what either end has gone on.
-                    gone_on = self._gone_on[end] / length + max(offsets[1 - end], 0.0)
-                    gone_on += _LONGER_PX * step.pixel
-                    offsets[end] = max(offsets[end], min(-gone_on, 0.0))
+            offsets[end] = self._held(end, steps[end], offsets[1 - end], length, seen[1 - end])
         for end in (0, 1):
             if seen[end]:
                 self._seen_ns[end] = now_ns
@@ -108,6 +95,23 @@ class EndWatch:
             self._remember(length * (1.0 + sum(offsets)), now_ns)
         self._last_ns = now_ns
         return offsets[0], offsets[1]
+
+    def _held(
+        self, end: int, step: EndStep | None, other: float, length: float, other_is_seen: bool
+    ) -> float:
+        """The offset of an end whose step does not count, beside the `other` end's."""
+        lacking = self.length / length - 1.0 - other
+        bound = 0.0 if step is None else _DRAWN_PX * step.pixel
+        if step is not None and not step.alone:
+            return max(min(max(step.offset, 0.0), lacking), -bound)
+        if not other_is_seen:
+            return 0.0
+        offset = min(max(lacking, -bound), bound)
+        if step is None or step.offset_px <= 0:
+            return offset
+        # What is too long lies elsewhere, but for what either end has gone on.
+        gone_on = self._gone_on[end] / length + max(other, 0.0) + _LONGER_PX * step.pixel
+        return max(offset, min(-gone_on, 0.0))
 
     def _doubted(
         self,

@@ -69,7 +69,7 @@ class Thread:
         """As it was who followed the thread when that was sure last."""
         self._longest = 0.0
         self._seeded_at = 0.5
-        self._rest = self._failures = self._vain = 0
+        self._rest = self._failures = self._looks_in_vain = 0
 
     @property
     def is_held(self) -> bool:
@@ -151,7 +151,7 @@ class Thread:
         is_sure &= not self._strangers.is_found
         if is_sure:
             self._was_sure, self._known = True, copy.copy(self.follower)
-            self._vain = 0
+            self._looks_in_vain = 0
         if state.status is Status.TRACKING and not is_sure:
             state = replace(state, status=Status.OCCLUDED)
         self._state = state
@@ -186,7 +186,7 @@ class Thread:
         turn = self._failures - 1 if is_beside else None
         if self.follower is not None:
             last, rig = self.follower.last_good, self.follower.rig
-            is_known = self._failures <= _ATTEMPTS and self._vain < _LOOKS
+            is_known = self._failures <= _ATTEMPTS and self._looks_in_vain < _LOOKS
             before = self._who_knows_its_length() if is_known else ()
             return Again(self._seed, self._setup, last, lengths(before), rig, before, turn)
         assert self._state.curve is not None
@@ -200,7 +200,7 @@ class Thread:
         is_due = self._may_be_aside and now_ns - self.looked_ns >= _PAUSE_NS
         if not (is_due or self._sureness.asks_for_look(curve, now_ns)):
             return None
-        before = self._who_knows_its_length() if self._vain < _LOOKS else ()
+        before = self._who_knows_its_length() if self._looks_in_vain < _LOOKS else ()
         return Closer(self._place_to_look_from(curve), self._setup, curve, before)
 
     def _who_knows_its_length(self) -> tuple[Follower, ...]:
@@ -227,7 +227,7 @@ class Thread:
         if isinstance(search, FromSeed):
             self._take_first(outcome, look.fields)
         elif outcome.pursuit is None or outcome.pursuit.lies_on(others):
-            self._vain += isinstance(search, Closer) and not self._is_sure
+            self._looks_in_vain += isinstance(search, Closer) and not self._is_sure
         elif isinstance(search, Again):
             self._take_again(outcome, search.known_lengths)
         else:
