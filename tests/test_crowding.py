@@ -13,9 +13,10 @@ from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.crowding import covered, crowded
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
-from suturetrack.types import RidgeField, Seed, Stamp, Status, StereoFrame
+from suturetrack.types import Seed, Stamp, Status, StereoFrame
 from tests.painting import FPS, paint
 
 LEVELS = (0.8, 0.8)
@@ -29,12 +30,14 @@ def line(start: tuple[float, float], stop: tuple[float, float], bulge: float = 0
     return np.c_[flat, np.full(400, 200.0)]
 
 
-def flags(
-    rig: StereoRig, field: RidgeField, points: np.ndarray, others: Neighbours = NOBODY
-) -> np.ndarray:
+def images_of(rig: StereoRig, threads: list[np.ndarray]) -> Images:
+    return Images(paint(rig, threads, 0), rig, LEVELS)
+
+
+def flags(images: Images, points: np.ndarray, others: Neighbours = NOBODY) -> np.ndarray:
     points = points[::4]
-    both = views(rig, points, np.gradient(points, axis=0) * len(points))
-    return crowded(both, np.full(len(points), 1 / len(points)), field, LEVELS, others).others
+    both = views(images.rig, points, np.gradient(points, axis=0) * len(points))
+    return crowded(both, np.full(len(points), 1 / len(points)), images, others).others
 
 
 def hook(radius: float, lift: float) -> np.ndarray:
@@ -51,14 +54,14 @@ def hook(radius: float, lift: float) -> np.ndarray:
 
 def test_a_thread_on_its_own_is_alone(rig: StereoRig) -> None:
     thread = line((-25, 0), (25, 3), 6.0)
-    assert not flags(rig, paint(rig, [thread], 0), thread).any()
+    assert not flags(images_of(rig, [thread]), thread).any()
 
 
 def test_a_ridge_that_crosses_at_a_shallow_angle_crowds_the_thread_where_both_are_near(
     rig: StereoRig,
 ) -> None:
     thread, stray = line((-25, 0), (25, 0)), line((-25, -6), (25, 6))
-    found = flags(rig, paint(rig, [thread, stray], 0), thread)
+    found = flags(images_of(rig, [thread, stray]), thread)
     away = np.abs(rig.focal / 200.0 * (stray - thread)[::4, 1])
     assert found[away < 4.0].all()
     assert not found[away > 9.0].any()
@@ -71,7 +74,7 @@ def test_a_known_strand_crowds_the_thread_although_both_are_one_ridge(rig: Stere
     both = views(rig, there, np.gradient(there, axis=0))
     seen = np.ones(len(there), bool)
     others = Neighbours(((Strand.other(both[0], seen), Strand.other(both[1], seen)),))
-    found = flags(rig, paint(rig, [thread], 0), thread, others)
+    found = flags(images_of(rig, [thread]), thread, others)
     assert found[55:].all()
     assert not found[:45].any()
 
@@ -83,11 +86,11 @@ def test_a_known_strand_that_the_field_does_not_show_leaves_the_thread_alone(
     both = views(rig, other, np.gradient(other, axis=0))
     strands = tuple(Strand.other(view, np.ones(len(other), bool)) for view in both)
     known = Neighbours(((strands[0], strands[1]),))
-    alone, beside = paint(rig, [thread], 0), paint(rig, [thread, other], 0)
-    assert known.shown_in(alone, LEVELS).threads == ()
-    assert known.shown_in(beside, LEVELS).threads == known.threads
-    assert flags(rig, beside, thread, known.shown_in(beside, LEVELS)).any()
-    assert not flags(rig, alone, thread, known.shown_in(alone, LEVELS)).any()
+    alone, beside = images_of(rig, [thread]), images_of(rig, [thread, other])
+    assert known.shown_in(alone).threads == ()
+    assert known.shown_in(beside).threads == known.threads
+    assert flags(beside, thread, known.shown_in(beside)).any()
+    assert not flags(alone, thread, known.shown_in(alone)).any()
     samples = views(rig, thread, np.gradient(thread, axis=0) * len(thread))
     hidden = covered(samples, known)
     away = np.abs(rig.focal / 200.0 * (other - thread)[:, 1])
@@ -116,7 +119,7 @@ def test_an_arc_does_not_slip_onto_the_line_that_cuts_it(rig: StereoRig) -> None
 
 def test_a_tip_beside_its_own_thread_crowds_it_and_a_loop_does_not(rig: StereoRig) -> None:
     thread = hook(3.0, -1.0)
-    found = flags(rig, paint(rig, [thread], 0), thread)
+    found = flags(images_of(rig, [thread]), thread)
     away = rig.focal / 200.0 * np.abs(thread[::4, 1] - thread[0, 1])
     tip = np.flatnonzero((away > 4.5) & (np.arange(len(away)) > len(away) / 2))[-1]
     assert found[tip + 3 :].all()
@@ -130,7 +133,7 @@ def test_what_the_views_show_differently_beside_another_thread_tells_no_depth(
     moved = thread + np.array([0.15, -0.15, 1.5])
     knots = nurbs.clamped_knots(np.linspace(0, 1, 12)[1:-1], 3)
     before = nurbs.fit(thread, np.linspace(0, 1, len(thread)), knots, 3)
-    field = paint(rig, [moved], 0, noise=0.0)
+    images = Images(paint(rig, [moved], 0, noise=0.0), rig, LEVELS)
     both = views(rig, thread, np.gradient(thread, axis=0))
     beside = (replace(view, pixels=view.pixels + view.normals) for view in both)
     left, right = (Strand.other(view, np.ones(len(thread), bool)) for view in beside)
@@ -138,7 +141,7 @@ def test_what_the_views_show_differently_beside_another_thread_tells_no_depth(
     for others in (NOBODY, Neighbours(((left, right),))):
         curve = before
         for _ in range(20):
-            fit = gauss_newton.fit(curve, curve, field, rig, LEVELS, 5.0, TrackingConfig(), others)
+            fit = gauss_newton.fit(curve, curve, images, 5.0, TrackingConfig(), others)
             assert fit.crowd.others.all() == bool(others.threads)
             curve = fit.curve
         step = nurbs.evaluate(curve, np.array([0.5])) - nurbs.evaluate(before, np.array([0.5]))

@@ -12,6 +12,7 @@ from suturetrack.tracking.end_watch import EndWatch
 from suturetrack.tracking.ends import EndStep, end_shift, find_end
 from suturetrack.tracking.energies import measure_levels
 from suturetrack.tracking.folds import doubled_ends
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import KnownLength
 from suturetrack.types import Nurbs, Seed, Stamp, StereoFrame
 from tests.painting import paint
@@ -48,9 +49,9 @@ def test_ends_are_found_without_bias_in_what_the_filter_shows() -> None:
         segmenter.learn(frame, Seed(pixel=scene.seed_pixel(0)))
         field = segmenter.step(frame)
         curve = curve_through(scene.truth(0)[0].points)
-        levels = measure_levels(curve, field, scene.rig)
+        images = Images(field, scene.rig, measure_levels(curve, field, scene.rig))
         for end in (0, 1):
-            found = find_end(curve, end, field, scene.rig, levels)
+            found = find_end(curve, end, images)
             assert found is not None
             offsets.append(found.offset_px)
     assert np.abs(offsets).max() < 1.0
@@ -69,9 +70,9 @@ def test_the_views_tell_the_depth_of_ends_that_run_along_an_epipolar_line() -> N
     truth = along_a_row(rig, (200.0, 200.0))
     guess = curve_through(along_a_row(rig, (197.0, 202.0)))
     field = paint(rig, [truth], 0, noise=0.0)
-    levels = measure_levels(curve_through(truth), field, rig)
+    images = Images(field, rig, measure_levels(curve_through(truth), field, rig))
     for end in (0, 1):
-        told = end_shift(guess, end, field, rig, levels)
+        told = end_shift(guess, end, images)
         assert told is not None
         shift, row = told
         assert abs(shift) > 1.0
@@ -79,7 +80,7 @@ def test_the_views_tell_the_depth_of_ends_that_run_along_an_epipolar_line() -> N
         assert shift == pytest.approx(float(row @ missing), abs=0.4)
     curve, config = guess, TrackingConfig()
     for _ in range(30):
-        curve = gauss_newton.fit(curve, curve, field, rig, levels, 5.0, config).curve
+        curve = gauss_newton.fit(curve, curve, images, 5.0, config).curve
     off = curve.control_points[[0, -1], 2] - truth[[0, -1], 2]
     assert np.abs(off).max() < 0.6
 

@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +21,7 @@ from suturetrack.initialization import (
 from suturetrack.initialization.matching import raised
 from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.tracking.follower import Follower
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.recovery import Setup, directed, doubting_ends
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.searches import FromSeed
@@ -531,10 +531,10 @@ def test_a_revoked_curve_does_not_tell_the_length(
     step, revoked_at = Strangers.step, 10
 
     def accuse(
-        self: Strangers, curve: Nurbs, seen: Bool, field: RidgeField, *args: Any
+        self: Strangers, curve: Nurbs, seen: Bool, images: Images, others: Neighbours
     ) -> Strangers:
-        strangers = step(self, curve, seen, field, *args)
-        return replace(strangers, is_found=field.stamp.frame == revoked_at)
+        strangers = step(self, curve, seen, images, others)
+        return replace(strangers, is_found=images.field.stamp.frame == revoked_at)
 
     looks_by(monkeypatch, look)
     monkeypatch.setattr(Strangers, "step", accuse)

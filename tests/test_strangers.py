@@ -11,6 +11,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
 from suturetrack.tracking import Tracker
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
 from suturetrack.tracking.strangers import Strangers
@@ -48,7 +49,7 @@ def found(
     strangers, flags = Strangers(), []
     for points, field in zip(followed, shown, strict=True):
         curve = curve_through(points)
-        strangers = strangers.step(curve, np.ones(64, bool), field, rig, LEVELS, others)
+        strangers = strangers.step(curve, np.ones(64, bool), Images(field, rig, LEVELS), others)
         flags.append(strangers.is_found)
     return flags
 
@@ -85,7 +86,7 @@ def test_another_thread_that_is_held_is_no_stranger(rig: StereoRig) -> None:
         left, right = views(rig, other, np.gradient(other, axis=0))
         others = Neighbours(((Strand.other(left, seen), Strand.other(right, seen)),))
         curve = curve_through(line())
-        strangers = strangers.step(curve, np.ones(64, bool), field, rig, LEVELS, others)
+        strangers = strangers.step(curve, np.ones(64, bool), Images(field, rig, LEVELS), others)
         assert not strangers.is_found
 
 

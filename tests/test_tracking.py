@@ -17,6 +17,7 @@ from suturetrack.tracking.control_points import rearrange, refit
 from suturetrack.tracking.drift import Drift
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.gauss_newton import expected
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Evidence
 from suturetrack.tracking.sampling import Samples
 from suturetrack.types import Nurbs, RidgeField, Seed, Status, ThreadState
@@ -158,11 +159,11 @@ def test_a_thread_that_moves_across_itself_is_expected_to_fade(rig: StereoRig) -
     points = np.stack([x, 0 * x, 200 + 0 * x], axis=1)
     s = np.linspace(0, 1, 200)
     curve = nurbs.fit(points, s, nurbs.clamped_knots(np.linspace(0, 1, 6)[1:-1], 3), 3)
-    samples = Samples.of(curve.knots, 5)
+    samples, images = Samples.of(curve.knots, 5), Images(paint(rig, [], 0), rig, (0.8, 0.4))
 
     def response(move: tuple[float, float]) -> tuple[float, float]:
         moved = replace(curve, control_points=curve.control_points + np.array([*move, 0.0]))
-        left, right = expected(curve, moved, samples, rig, (0.8, 0.4))
+        left, right = expected(curve, moved, samples, images)
         return float(left.mean()), float(right.mean())
 
     assert response((2.0, 0.0)) == pytest.approx((0.8, 0.4))
@@ -533,15 +534,14 @@ def test_what_has_not_been_followed_to_its_end_is_not_called_tracking(
 
 def test_a_tip_that_one_view_alone_shows_is_cut_off_if_it_is_short(rig: StereoRig) -> None:
     points = thread(0.0)
-    field = paint(rig, [points], 0)
-    levels = 1.0, 1.0
+    images = Images(paint(rig, [points], 0), rig, (1.0, 1.0))
     for share, is_cut in ((0.06, True), (0.25, False)):
         aside = points.copy()
         count = round(share * len(points))
         aside[:count] *= np.linspace(1.15, 1.08, count)[:, None]  # Along the lines of sight.
         travelled = np.linspace(0, 1, len(aside))
         curve = nurbs.fit(aside, travelled, nurbs.clamped_knots(np.linspace(0, 1, 40)[1:-1], 3), 3)
-        fit = gauss_newton.observe(curve, field, rig, levels, TrackingConfig())
+        fit = gauss_newton.observe(curve, images, TrackingConfig())
         left = Evidence.of(fit).without_half_seen_tips()
         assert nurbs.length(left) < nurbs.length(curve) - 4.0 if is_cut else left is fit.curve
 

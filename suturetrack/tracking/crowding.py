@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.kernels import search
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import View
 from suturetrack.tracking.strands import SAME_STRAND_PX, Neighbours, Strand
-from suturetrack.types import Bool, Float32, Float64, RidgeField
+from suturetrack.types import Bool, Float32, Float64
 
 # The filter blurs ridges that are nearer than this into one another.
 _NEAR_PX = 4.0
@@ -33,8 +34,7 @@ class Crowd:
 def crowded(
     both: tuple[View, View],
     share: Float64,
-    field: RidgeField,
-    levels: tuple[float, float],
+    images: Images,
     neighbours: Neighbours,
 ) -> Crowd:
     """Looks beside the samples of a curve.
@@ -42,12 +42,12 @@ def crowded(
     Args:
         both: the samples as predicted, left and right.
         share: (k,) part of the curve that each stands for.
-        levels: response of a clear view of the thread, left and right.
         neighbours: other threads.
     """
-    images = field.left, field.right
     flags, itself = np.zeros(len(share), bool), np.zeros(len(share), bool)
-    for image, view, level, others in zip(images, both, levels, neighbours.both, strict=True):
+    for image, view, level, others in zip(
+        images.both, both, images.levels, neighbours.both, strict=True
+    ):
         own = Strand.of(view, share)
         touching = search.doubled(own.arrays, own.arrays, SAME_STRAND_PX, _NEAR_PX)
         flags |= _beside(image, view, own, view.speed * share, level, others)

@@ -12,8 +12,9 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.ends import before_a_hole, narrowness
 from suturetrack.kernels.boundary import outer_boundary
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import View, derivatives_at, distinct, views, views_at
-from suturetrack.types import Float64, Nurbs, RidgeField
+from suturetrack.types import Float64, Nurbs
 
 _STEP_PX = 0.5
 _INWARD_PX, _OUTWARD_PX = 40.0, 10.0
@@ -51,22 +52,20 @@ class EndStep:
 def find_end(
     curve: Nurbs,
     end: int,
-    field: RidgeField,
-    rig: StereoRig,
-    levels: tuple[float, float],
+    images: Images,
 ) -> EndStep | None:
     """Looks for the step of the response at the end `end` (0 or 1), in both images at once.
 
     None where there is no thread near the end.
     """
-    scale = _px_per_s(curve, end, rig)
-    x, both, responses = _profiles(curve, end, field, rig, levels, scale)
-    inside = both[0].inside(rig.image_size) & both[1].inside(rig.image_size)
+    scale = _px_per_s(curve, end, images.rig)
+    x, both, responses = _profiles(curve, end, images, scale)
+    inside = both[0].inside(images.rig.image_size) & both[1].inside(images.rig.image_size)
     if np.count_nonzero(inside) < _SMOOTHED:
         return None
     narrow = [
         response * narrowness(image, view.pixels, view.tangents, x)
-        for image, view, response in zip((field.left, field.right), both, responses, strict=True)
+        for image, view, response in zip(images.both, both, responses, strict=True)
     ]
     x, mean, least, alone = (
         x[inside],
@@ -85,9 +84,7 @@ def find_end(
 def end_shift(
     curve: Nurbs,
     end: int,
-    field: RidgeField,
-    rig: StereoRig,
-    levels: tuple[float, float],
+    images: Images,
 ) -> tuple[float, Float64] | None:
     """By how much further the right view shows the thread at the end `end` (0 or 1) than the left.
 
@@ -97,15 +94,15 @@ def end_shift(
         The difference in px along the curve, and its (3,) derivative by the place of the end; None
         where the views do not both show the end.
     """
-    scale = _px_per_s(curve, end, rig)
-    x, both, responses = _profiles(curve, end, field, rig, levels, scale)
+    scale = _px_per_s(curve, end, images.rig)
+    x, both, responses = _profiles(curve, end, images, scale)
     tip = int(np.searchsorted(x, 0.0))
     shown, rows = [], []
     for view, response in zip(both, responses, strict=True):
         smooth = _smooth(response)
         found, _ = outer_boundary(x, smooth, smooth)
         # Not where it is nan, either.
-        if not (view.inside(rig.image_size).all() and abs(found) <= _SHOWN_PX):
+        if not (view.inside(images.rig.image_size).all() and abs(found) <= _SHOWN_PX):
             return None
         shown.append(found)
         rows.append(view.tangents[tip] @ view.jacobian[tip] / view.speed[tip])
@@ -116,17 +113,15 @@ def end_shift(
 def _profiles(
     curve: Nurbs,
     end: int,
-    field: RidgeField,
-    rig: StereoRig,
-    levels: tuple[float, float],
+    images: Images,
     scale: float,
 ) -> tuple[Float64, tuple[View, View], list[Float64]]:
     """(k,) px beyond the end, the curve there in both images, and their (k,) responses."""
     x = np.arange(-min(_INWARD_PX, 0.5 * scale), _OUTWARD_PX + 0.1, _STEP_PX)
-    both = views(rig, *_extension(curve, end, np.asarray(x / scale, np.float64)))
+    both = views(images.rig, *_extension(curve, end, np.asarray(x / scale, np.float64)))
     responses = [
         np.minimum(view.responses(image) / level, 1.2)
-        for image, view, level in zip((field.left, field.right), both, levels, strict=True)
+        for image, view, level in zip(images.both, both, images.levels, strict=True)
     ]
     return x, both, responses
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from suturetrack.camera import StereoRig
 from suturetrack.tracking import gauss_newton
 from suturetrack.tracking.alignment import shifted
 from suturetrack.tracking.config import TrackingConfig
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.reliability import Evidence
 from suturetrack.tracking.strands import Neighbours
-from suturetrack.types import Nurbs, RidgeField
+from suturetrack.types import Nurbs
 
 # Searches, in units of the first: tried where less than the second is seen, taken if they show more.
 _WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
@@ -21,9 +21,7 @@ _RETRY = 5
 def fit_widely(
     before: Nurbs,
     predicted: Nurbs,
-    field: RidgeField,
-    rig: StereoRig,
-    levels: tuple[float, float],
+    images: Images,
     share: float,
     config: TrackingConfig,
     neighbours: Neighbours,
@@ -33,23 +31,19 @@ def fit_widely(
     Args:
         before: the curve in the last field.
         predicted: where it should be in this one.
-        field: what shows it.
-        rig: the cameras.
-        levels: response of a clear view of the thread, left and right.
+        images: what shows it.
         share: what was seen of it in the last field.
         config: how far is looked.
-        neighbours: other threads that the field shows.
+        neighbours: other threads that the images show.
     """
 
     def fitted(start: Nurbs, reach_px: float) -> Evidence:
-        return Evidence.of(
-            gauss_newton.fit(before, start, field, rig, levels, reach_px, config, neighbours)
-        )
+        return Evidence.of(gauss_newton.fit(before, start, images, reach_px, config, neighbours))
 
     best = fitted(predicted, config.search_px)
-    usual = 1.0 if field.stamp.frame % _RETRY == 0 else share - _DROP
+    usual = 1.0 if images.field.stamp.frame % _RETRY == 0 else share - _DROP
     if best.share < min(_ENOUGH, usual):
-        jumped = fitted(shifted(predicted, field, rig, levels), config.search_px)
+        jumped = fitted(shifted(predicted, images), config.search_px)
         if jumped.share > best.share + _GAIN:
             best = jumped
     for times, enough, gain in _WIDER:

@@ -20,6 +20,7 @@ from suturetrack.tracking.ends import EndStep, find_end, with_ends
 from suturetrack.tracking.energies import energies, measure_levels
 from suturetrack.tracking.fitting import fit_widely
 from suturetrack.tracking.folds import doubled_ends
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.motion import Motion
 from suturetrack.tracking.mouth import Mouth
@@ -133,31 +134,33 @@ class Follower:
         """The thread in the next field; `neighbours` are other threads."""
         model = self.model
         seconds = (field.stamp.capture_ns - model.capture_ns) * _NS
+        images = Images(field, self.rig, model.levels)
         if self._lost or self.known_length.is_short(length_of(model.curve)):
-            self._take_up_whole(field, seconds)
+            self._take_up_whole(images, seconds)
             model = self.model
         before, predicted = model.curve, model.motion.predict(model.curve, seconds)
         model.capture_ns = field.stamp.capture_ns
         if self.config.method == "paper":
-            evidence, inserted, removed = self._follow_by_forces(field, neighbours)
+            evidence, inserted, removed = self._follow_by_forces(images, neighbours)
         else:
             evidence, inserted, removed = self._follow_by_least_squares(
-                field, predicted, neighbours
+                images, predicted, neighbours
             )
             self._learn_motion(before, evidence, seconds)
         self._drift.grow(before, predicted, model.curve, evidence.evenly_seen, self.rig)
-        for further, more, fewer in self._follow_into_sight(field, neighbours):
+        for further, more, fewer in self._follow_into_sight(images, neighbours):
             evidence, inserted, removed = further, inserted + more, removed + fewer
         if self.config.method != "paper":
-            evidence = self._grow_ends_anew(field, evidence, neighbours)
+            evidence = self._grow_ends_anew(images, evidence, neighbours)
         self._seen = evidence.evenly_seen
         if evidence.share >= 0.5:
             model.seen_ns = model.capture_ns
             self._learn_levels(field)
+            images = replace(images, levels=model.levels)
         events = []
         if inserted or removed:
             events.append(f"control points: {inserted} inserted, {removed} removed")
-        astray, plain = evidence.astray(field, self.rig, model.levels, neighbours)
+        astray, plain = evidence.astray(images, neighbours)
         status = self._judge(evidence, astray, plain, seconds)
         return self._state(field, thread, evidence, status, events)
 
@@ -253,47 +256,39 @@ class Follower:
         ends = EndWatch(self.known_length.now, model.capture_ns)
         self.model = replace(model, curve=self.last_good, motion=Motion.none(), ends=ends)
 
-    def _take_up_whole(self, field: RidgeField, seconds: float) -> None:
+    def _take_up_whole(self, images: Images, seconds: float) -> None:
         """Goes back to the last good curve, moved as a whole, if the images show more of it than of
         what is left."""
         model = self.model
         rest = model.motion.predict(model.curve, seconds)
-        whole = shifted(self.last_good, field, self.rig, model.levels)
-        of_whole, of_rest = (
-            length_of(curve) * shown(curve, field, self.rig, model.levels)
-            for curve in (whole, rest)
-        )
+        whole = shifted(self.last_good, images)
+        of_whole, of_rest = (length_of(curve) * shown(curve, images) for curve in (whole, rest))
         if of_whole > of_rest + _MORE * self.known_length.now:
             self.last_good = whole
             self._start_again()
             self._drift = Drift.everywhere()
 
     def _follow_by_forces(
-        self, field: RidgeField, neighbours: Neighbours
+        self, images: Images, neighbours: Neighbours
     ) -> tuple[Evidence, int, int]:
         model, config = self.model, self.config
-        cutoffs = (
-            paper.cutoff(field.left, model.levels[0]),
-            paper.cutoff(field.right, model.levels[1]),
-        )
-        curve = paper.fit(model.curve, field, self.rig, cutoffs, config.paper)
-        fit = gauss_newton.observe(curve, field, self.rig, model.levels, config, neighbours)
+        left, right = map(paper.cutoff, images.both, images.levels)
+        curve = paper.fit(model.curve, images.field, self.rig, (left, right), config.paper)
+        fit = gauss_newton.observe(curve, images, config, neighbours)
         model.curve, inserted, removed = respace(curve, self.rig, config.paper.spacing_px)
         return Evidence.of(fit), inserted, removed
 
     def _follow_by_least_squares(
-        self, field: RidgeField, predicted: Nurbs, neighbours: Neighbours
+        self, images: Images, predicted: Nurbs, neighbours: Neighbours
     ) -> tuple[Evidence, int, int]:
         model = self.model
         best = fit_widely(
             model.curve,
             predicted,
-            field,
-            self.rig,
-            model.levels,
+            images,
             self._share,
             self.config,
-            neighbours.shown_in(field, model.levels),
+            neighbours.shown_in(images),
         )
         self._share = best.share
         # What was just drawn out may have been drawn out in depth.
@@ -302,7 +297,7 @@ class Follower:
         if best.share > 0.3:
             known = covered(best.fit.views(self.rig), neighbours)
             cut = length_of(best.fit.curve) / length_of(model.curve) - 1.0
-            self._adjust_ends(field, best.fit.crowd.others, known, cut)
+            self._adjust_ends(images, best.fit.crowd.others, known, cut)
         self._cut_doubled_ends()
         model.curve, inserted, removed = rearrange(model.curve, self.rig)
         return best, inserted, removed
@@ -316,7 +311,7 @@ class Follower:
         )
 
     def _follow_into_sight(
-        self, field: RidgeField, neighbours: Neighbours
+        self, images: Images, neighbours: Neighbours
     ) -> Iterator[tuple[Evidence, int, int]]:
         """Goes on in the same field while an end is drawn out far: by no more than the thread was long, for
         fear of a tool, or than comes in at the border."""
@@ -327,12 +322,12 @@ class Follower:
             may_be_longer = length_of(before) < max(self.known_length.possible)
             if not (self._leaps.any() and (self._comes_in or may_be_longer)):
                 return
-            step = self._follow_by_least_squares(field, before, neighbours)
+            step = self._follow_by_least_squares(images, before, neighbours)
             self._drift.grow(before, before, model.curve, step[0].evenly_seen, self.rig)
             yield step
 
     def _grow_ends_anew(
-        self, field: RidgeField, evidence: Evidence, neighbours: Neighbours
+        self, images: Images, evidence: Evidence, neighbours: Neighbours
     ) -> Evidence:
         """Every now and then, the ends that are not seen, where the thread plainly ends elsewhere."""
         model, known, tails = self.model, self.known_length, unseen_tails(evidence)
@@ -340,17 +335,15 @@ class Follower:
         if not (tails and known.is_established) or 0 <= rested_s < _REGROWN_S:
             return evidence
         self._regrown_ns = model.capture_ns
-        others = neighbours.shown_in(field, model.levels)
+        others = neighbours.shown_in(images)
 
         def fitted(curve: Nurbs) -> Evidence:
-            reach_px, levels = self.config.search_px, model.levels
+            reach_px = self.config.search_px
             return Evidence.of(
-                gauss_newton.fit(
-                    curve, curve, field, self.rig, levels, reach_px, self.config, others
-                )
+                gauss_newton.fit(curve, curve, images, reach_px, self.config, others)
             )
 
-        found = regrown(model.curve, tails, known, field, self.rig, model.levels, fitted)
+        found = regrown(model.curve, tails, known, images, fitted)
         if found is None:
             return evidence
         model.curve = found.fit.curve
@@ -367,25 +360,25 @@ class Follower:
         if start or stop:
             model.curve = nurbs.part(model.curve, start, 1.0 - stop)
 
-    def _adjust_ends(self, field: RidgeField, crowded: Bool, known: Bool, cut: float) -> None:
+    def _adjust_ends(self, images: Images, crowded: Bool, known: Bool, cut: float) -> None:
         """Moves the ends.
 
         Args:
-            field: what shows them.
+            images: what shows them.
             crowded: (k,) samples beside other ridges.
             known: (k,) samples on other threads.
             cut: what tips were cut off to be found anew, as a part of the length that is left.
         """
         model = self.model
         steps = [
-            self._end_step(end, field, bool(crowded[tip].any()), bool(known[tip].any()))
+            self._end_step(end, images, bool(crowded[tip].any()), bool(known[tip].any()))
             for end, tip in enumerate((slice(_TIP), slice(-_TIP, None)))
         ]
         start, stop = model.ends.moves(
             steps[0],
             steps[1],
             length_of(model.curve),
-            field.stamp.capture_ns,
+            images.field.stamp.capture_ns,
             is_known=self.known_length.is_established,
         )
         if start or stop:
@@ -398,10 +391,10 @@ class Follower:
         )
 
     def _end_step(
-        self, end: int, field: RidgeField, crowded: bool, on_another: bool
+        self, end: int, images: Images, crowded: bool, on_another: bool
     ) -> EndStep | None:
-        model, now_ns = self.model, field.stamp.capture_ns
-        step = find_end(model.curve, end, field, self.rig, model.levels)
+        model, now_ns = self.model, images.field.stamp.capture_ns
+        step = find_end(model.curve, end, images)
         alone = not (crowded or on_another)
         step = step and replace(step, alone=alone, on_another=on_another)
         other = self._mouths[1 - end]

@@ -19,9 +19,10 @@ from suturetrack.nurbs import curve_from
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.crowding import Crowd, crowded
 from suturetrack.tracking.ends import end_shift
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import Samples, View, views
 from suturetrack.tracking.strands import NOBODY, SAME_STRAND_PX, Neighbours, Strand
-from suturetrack.types import Bool, Float32, Float64, Nurbs, RidgeField
+from suturetrack.types import Bool, Float32, Float64, Nurbs
 
 _STEP_PX = 0.5
 # Offsets measured closer than this along the thread share their noise: the filter smears it.
@@ -102,9 +103,7 @@ def search_normals(
 def fit(
     before: Nurbs,
     predicted: Nurbs,
-    field: RidgeField,
-    rig: StereoRig,
-    levels: tuple[float, float],
+    images: Images,
     reach_px: float,
     config: TrackingConfig,
     neighbours: Neighbours = NOBODY,
@@ -114,21 +113,20 @@ def fit(
     Args:
         before: the curve in the last field, on the same knots.
         predicted: cubic, parametrised like its arc length.
-        levels: response of a clear view of the thread, left and right.
         reach_px: how far along the normals the thread is looked for at first.
         neighbours: other threads that the field shows.
     """
     samples = Samples.of(predicted.knots, config.samples_per_span)
     reference = _Reference.of(samples, predicted)
     control_points = predicted.control_points
-    crowd = _crowd(predicted, samples, field, rig, levels, neighbours)
+    crowd = _crowd(predicted, samples, images, neighbours)
     surprise: Float64 | None = None
-    tips = [end_shift(predicted, end, field, rig, levels) for end in (0, 1)]
-    faded = expected(before, predicted, samples, rig, levels)
+    tips = [end_shift(predicted, end, images) for end in (0, 1)]
+    faded = expected(before, predicted, samples, images)
     reach, outlier = reach_px, math.inf
     rounds = config.iterations + round(math.log2(max(reach_px / config.search_px, 1.0)))
     for _ in range(rounds):
-        linear = _Linearized(samples, control_points, field, rig, faded, reach, neighbours)
+        linear = _Linearized(samples, control_points, images, faded, reach, neighbours)
         surprise = linear.surprise(crowd) if surprise is None else surprise
         equations = linear.equations(reference, faded, config, outlier, crowd, surprise)
         equations.add_tips(tips, predicted.control_points - control_points)
@@ -136,24 +134,22 @@ def fit(
         outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
         reach = max(reach / 2, _REFINED_PX)
     curve = curve_from(spline.DEGREE, predicted.knots, control_points)
-    residual = _residual(rig.project(samples.values(control_points)), linear)
+    residual = _residual(images.rig.project(samples.values(control_points)), linear)
     covariance = equations.covariance(samples)
     return Fit(curve, samples, linear.offsets, residual, covariance, crowd)
 
 
 def observe(
     curve: Nurbs,
-    field: RidgeField,
-    rig: StereoRig,
-    levels: tuple[float, float],
+    images: Images,
     config: TrackingConfig,
     neighbours: Neighbours = NOBODY,
 ) -> Fit:
     """What the field says about a curve that something else has fitted."""
     samples = Samples.of(curve.knots, config.samples_per_span)
-    still = expected(curve, curve, samples, rig, levels)
-    crowd = _crowd(curve, samples, field, rig, levels, neighbours)
-    linear = _Linearized(samples, curve.control_points, field, rig, still, _REFINED_PX, neighbours)
+    still = expected(curve, curve, samples, images)
+    crowd = _crowd(curve, samples, images, neighbours)
+    linear = _Linearized(samples, curve.control_points, images, still, _REFINED_PX, neighbours)
     reference, surprise = _Reference.of(samples, curve), linear.surprise(crowd)
     equations = linear.equations(reference, still, config, _OUTLIER_PX, crowd, surprise)
     equations.solve()
@@ -162,31 +158,20 @@ def observe(
     return Fit(curve, samples, linear.offsets, residual, covariance, crowd)
 
 
-def _crowd(
-    curve: Nurbs,
-    samples: Samples,
-    field: RidgeField,
-    rig: StereoRig,
-    levels: tuple[float, float],
-    neighbours: Neighbours,
-) -> Crowd:
-    both = samples.views(rig, curve.control_points)
-    return crowded(both, samples.share, field, levels, neighbours)
+def _crowd(curve: Nurbs, samples: Samples, images: Images, neighbours: Neighbours) -> Crowd:
+    both = samples.views(images.rig, curve.control_points)
+    return crowded(both, samples.share, images, neighbours)
 
 
 def expected(
-    before: Nurbs,
-    after: Nurbs,
-    samples: Samples,
-    rig: StereoRig,
-    levels: tuple[float, float],
+    before: Nurbs, after: Nurbs, samples: Samples, images: Images
 ) -> tuple[Float64, Float64]:
     """(k,) the response of the thread left and right where it moves, which smears it."""
-    both = samples.views(rig, after.control_points)
-    last = rig.project(samples.values(before.control_points))
+    both = samples.views(images.rig, after.control_points)
+    last = images.rig.project(samples.values(before.control_points))
     left, right = (
         level * np.maximum(1 / (1 + (_across(view, pixels) / _SMEARED_PX) ** 4), _LEAST_FADING)
-        for view, pixels, level in zip(both, last, levels, strict=True)
+        for view, pixels, level in zip(both, last, images.levels, strict=True)
     )
     return left, right
 
@@ -219,8 +204,7 @@ class _Linearized:
         self,
         samples: Samples,
         control_points: Float64,
-        field: RidgeField,
-        rig: StereoRig,
+        images: Images,
         levels: tuple[Float64, Float64],
         reach_px: float,
         neighbours: Neighbours,
@@ -229,11 +213,11 @@ class _Linearized:
         self.points, self.first, self.second = (
             samples.values(control_points, times) for times in range(3)
         )
-        self.views = views(rig, self.points, self.first)
+        self.views = views(images.rig, self.points, self.first)
         left, right = (
             search_normals(image, view, samples.share, level, reach_px, others)
             for image, view, level, others in zip(
-                (field.left, field.right), self.views, levels, neighbours.both, strict=True
+                images.both, self.views, levels, neighbours.both, strict=True
             )
         )
         self.offsets = left, right

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from suturetrack import nurbs
-from suturetrack.camera import StereoRig
 from suturetrack.tracking.control_points import rearrange
 from suturetrack.tracking.ends import find_end, with_ends
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Evidence, loose_ends
 from suturetrack.tracking.sampling import length_of
-from suturetrack.types import Nurbs, RidgeField
+from suturetrack.types import Nurbs
 
 # Samples that have to be unseen at an end, and that may be at most. One beside them may have left the
 # thread as well.
@@ -30,9 +30,7 @@ def regrown(
     curve: Nurbs,
     tails: dict[int, int],
     known: KnownLength,
-    field: RidgeField,
-    rig: StereoRig,
-    levels: tuple[float, float],
+    images: Images,
     fitted: Callable[[Nurbs], Evidence],
 ) -> Evidence | None:
     """The curve with an end elsewhere; None where what is not seen of its ends may be hidden.
@@ -45,14 +43,12 @@ def regrown(
         curve: as its ends are now.
         tails: of `unseen_tails`.
         known: what is known of the thread's length.
-        field: what shows the thread.
-        rig: the cameras.
-        levels: response of a clear view of the thread, left and right.
+        images: what shows the thread.
         fitted: lays a curve on the field.
     """
     found = None
     for end, unseen in tails.items():
-        other = _grown(_without(curve, end, unseen + _BESIDE), end, field, rig, levels, fitted)
+        other = _grown(_without(curve, end, unseen + _BESIDE), end, images, fitted)
         if other is not None and _is_plain(other, end, unseen, known):
             found, curve = other, other.fit.curve
     return found
@@ -66,19 +62,17 @@ def _without(curve: Nurbs, end: int, samples: int) -> Nurbs:
 def _grown(
     curve: Nurbs,
     end: int,
-    field: RidgeField,
-    rig: StereoRig,
-    levels: tuple[float, float],
+    images: Images,
     fitted: Callable[[Nurbs], Evidence],
 ) -> Evidence | None:
     """The curve drawn out along the ridge at an end, None if there is none."""
     evidence = None
     for _ in range(_STEPS):
-        step = find_end(curve, end, field, rig, levels)
+        step = find_end(curve, end, images)
         if step is None or step.offset_px < _LEAST_PX:
             break
         start, stop = (0.0, step.offset) if end else (step.offset, 0.0)
-        curve, _, _ = rearrange(with_ends(curve, -start, 1.0 + stop), rig)
+        curve, _, _ = rearrange(with_ends(curve, -start, 1.0 + stop), images.rig)
         evidence = fitted(curve)
         curve = evidence.fit.curve
     return evidence

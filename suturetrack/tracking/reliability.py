@@ -7,13 +7,13 @@ from functools import cached_property
 
 import numpy as np
 
-from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.nurbs import part
 from suturetrack.tracking.gauss_newton import Fit
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import View
 from suturetrack.tracking.strands import SAME_STRAND_PX, Neighbours, Strand
-from suturetrack.types import Bool, Float32, Float64, Int64, Nurbs, RidgeField, Status
+from suturetrack.types import Bool, Float32, Float64, Int64, Nurbs, Status
 
 RELIABILITY_SAMPLES = 64
 EVENLY = np.linspace(0, 1, RELIABILITY_SAMPLES)
@@ -93,23 +93,17 @@ class Evidence:
         """Whether nearly all of the thread is plain to see, with no other ridge beside it."""
         return bool((plain & self.alone).mean() > _CLEARLY)
 
-    def astray(
-        self,
-        field: RidgeField,
-        rig: StereoRig,
-        levels: tuple[float, float],
-        neighbours: Neighbours,
-    ) -> tuple[Bool, Bool]:
+    def astray(self, images: Images, neighbours: Neighbours) -> tuple[Bool, Bool]:
         """(k,) whether the curve has left the thread, and whether it is plainly on it.
 
         It has left where both images show a thread beside a stretch that is unseen; and where it lies
         on another strand in an image, with a strand beside it that is nobody's. It is plainly on the
         thread where it is seen and lies on no other strand.
         """
-        both, share = self.fit.views(rig), self.fit.samples.share
+        both, share = self.fit.views(images.rig), self.fit.samples.share
         unseen, left_alone, plain = ~self.seen, np.zeros(len(self.seen), bool), self.seen.copy()
         for image, view, level, others in zip(
-            (field.left, field.right), both, levels, neighbours.both, strict=True
+            images.both, both, images.levels, neighbours.both, strict=True
         ):
             own = Strand.of(view, share)
             all_seen = own.where(self.seen).joined(others)

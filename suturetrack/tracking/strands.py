@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from suturetrack.kernels import search
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import View
-from suturetrack.types import Bool, Float32, Float64, RidgeField
+from suturetrack.types import Bool, Float32, Float64
 
 SAME_STRAND_PX = 45.0
 """What is nearer than this along a curve is no other strand of it; a tight knot is a point."""
@@ -88,15 +89,11 @@ class Neighbours:
             left, right = left.joined(thread[0]), right.joined(thread[1])
         return left, right
 
-    def shown_in(self, field: RidgeField, levels: tuple[float, float]) -> Neighbours:
-        """Those that are seen in a field, which may be made for one thread.
-
-        Args:
-            levels: response of a clear view of that thread, left and right.
-        """
-        images = field.left, field.right
+    def shown_in(self, images: Images) -> Neighbours:
+        """Those that are seen in images, which may be made for one thread."""
+        both, levels = images.both, images.levels
         return Neighbours(
-            tuple(thread for thread in self.threads if any(map(_is_shown, thread, images, levels)))
+            tuple(thread for thread in self.threads if any(map(_is_shown, thread, both, levels)))
         )
 
 

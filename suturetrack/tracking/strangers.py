@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from suturetrack.camera import StereoRig
 from suturetrack.metrics import polyline_length
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import View, resampled, views_at
 from suturetrack.tracking.strands import Neighbours
-from suturetrack.types import Bool, Float32, Float64, Image, Nurbs, RidgeField
+from suturetrack.types import Bool, Float32, Float64, Image, Nurbs
 
 _PLACES = 96
 # What has moved is where no ridge was at some time in the last seconds, looked at so often.
@@ -52,39 +52,30 @@ class Strangers:
         """The same past, of which nothing has been said about another curve yet."""
         return replace(self, is_found=False, _suspected=False)
 
-    def step(
-        self,
-        curve: Nurbs,
-        seen: Bool,
-        field: RidgeField,
-        rig: StereoRig,
-        levels: tuple[float, float],
-        others: Neighbours,
-    ) -> Strangers:
+    def step(self, curve: Nurbs, seen: Bool, images: Images, others: Neighbours) -> Strangers:
         """With the next field; most fields change nothing.
 
         Args:
             seen: at evenly spaced parameters.
-            levels: response of a clear view of the thread, left and right.
             others: other threads.
         """
-        now = field.stamp.capture_ns
+        now = images.field.stamp.capture_ns
         if self._past and 0 <= now - self._past[-1][0] < _PAUSE_NS:
             return self
         past = tuple(then for then in self._past if 0 <= now - then[0] < _REMEMBERED_NS)
         s = np.linspace(0, 1, _PLACES)
-        both = views_at(rig, curve, s)
+        both = views_at(images.rig, curve, s)
         shown = resampled(seen, s)
         branches: list[Bool] = []
         ridges = []
-        for side, (image, view) in enumerate(zip((field.left, field.right), both, strict=True)):
+        for side, (image, view) in enumerate(zip(images.both, both, strict=True)):
             u, v = image[..., 0], image[..., 1]
-            power = np.asarray((u * u + v * v) / levels[side] ** 2, np.float32)
+            power = np.asarray((u * u + v * v) / images.levels[side] ** 2, np.float32)
             ridges.append(_packed(power))
             if past and (side == 0 or branches[0].any()):
                 always = np.bitwise_and.reduce([then[1][side] for then in past])
                 stayed = np.unpackbits(always, axis=1, count=power.shape[1])
-                own_px = _half_width(image, view, levels[side]) + _OWN_PX
+                own_px = _half_width(image, view, images.levels[side]) + _OWN_PX
                 crop = _around(view.pixels, power.shape, _MARGIN * own_px)
                 corner = np.array([crop[1].start, crop[0].start], float)
                 near = replace(view, pixels=view.pixels - corner)

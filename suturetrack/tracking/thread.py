@@ -11,6 +11,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.nurbs import evaluate
 from suturetrack.tracking.follower import Follower
+from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import has_length
 from suturetrack.tracking.looks import Look, Outcome
 from suturetrack.tracking.pursuit import Pursuit
@@ -138,9 +139,8 @@ class Thread:
         assert self.follower is not None
         assert self._sureness is not None
         model, rig = self.follower.model, self.follower.rig
-        self._strangers = self._strangers.step(
-            model.curve, state.seen, field, rig, model.levels, others
-        )
+        images = Images(field, rig, model.levels)
+        self._strangers = self._strangers.step(model.curve, state.seen, images, others)
         if self._strangers.is_found:
             self._sureness.revoke(model.curve, field.stamp.capture_ns)
 
