@@ -64,27 +64,21 @@ class Strangers:
             return self
         past = tuple(then for then in self._past if 0 <= now - then[0] < _REMEMBERED_NS)
         s = np.linspace(0, 1, _PLACES)
-        both = views_at(images.rig, curve, s)
-        shown = resampled(seen, s)
-        branches: list[Bool] = []
-        ridges = []
-        for side, (image, view) in enumerate(zip(images.both, both, strict=True)):
-            u, v = image[..., 0], image[..., 1]
-            power = np.asarray((u * u + v * v) / images.levels[side] ** 2, np.float32)
-            ridges.append(_packed(power))
-            if past and (side == 0 or branches[0].any()):
-                always = np.bitwise_and.reduce([then[1][side] for then in past])
+        views, shown = views_at(images.rig, curve, s), resampled(seen, s)
+        powers = [
+            np.asarray((image[..., 0] ** 2 + image[..., 1] ** 2) / level**2, np.float32)
+            for image, level in zip(images.both, images.levels, strict=True)
+        ]
+        branches = np.full(_PLACES, bool(past))
+        for side, (power, view, known) in enumerate(zip(powers, views, others.both, strict=True)):
+            if branches.any():
+                always = np.bitwise_and.reduce([ridges[side] for _, ridges in past])
                 stayed = np.unpackbits(always, axis=1, count=power.shape[1])
-                own_px = _half_width(image, view, images.levels[side]) + _OWN_PX
-                crop = _around(view.pixels, power.shape, _MARGIN * own_px)
-                corner = np.array([crop[1].start, crop[0].start], float)
-                near = replace(view, pixels=view.pixels - corner)
-                known = others.both[side].pixels - corner
-                found = _branches(power[crop], stayed[crop], near, shown, known, own_px)
-                branches.append(found)
-        suspected = len(branches) == 2 and bool((branches[0] & branches[1]).any())
-        is_found = suspected and self._suspected
-        return Strangers(is_found, suspected, (*past, (now, (ridges[0], ridges[1]))))
+                own_px = _half_width(images.both[side], view, images.levels[side]) + _OWN_PX
+                branches &= _branches(power, stayed, view, shown, known.pixels, own_px)
+        suspected = bool(branches.any())
+        now_ridges = _packed(powers[0]), _packed(powers[1])
+        return Strangers(suspected and self._suspected, suspected, (*past, (now, now_ridges)))
 
 
 def _packed(power: Float32) -> Image:
@@ -118,13 +112,31 @@ def _branches(
         others: (m, 2) pixels of other threads.
         own_px: what is nearer to the curve is its own ridge.
     """
-    away = _distances(power.shape, view.pixels, others)
+    crop = _around(view.pixels, power.shape, _MARGIN * own_px)
+    corner = np.array([crop[1].start, crop[0].start], float)
+    power, stayed, view = power[crop], stayed[crop], replace(view, pixels=view.pixels - corner)
+    away = _distances(power.shape, view.pixels, others - corner)
     ridge = (power > _RIDGE**2) & (away > own_px)
     if not (ridge & (stayed == 0)).any():
         return np.zeros(len(view.pixels), bool)
+    touched, moved = _sides(ridge, stayed, away, view, own_px)
+    spacing = max(polyline_length(view.pixels), 1.0) / (len(seen) - 1)
+    same, across = (round(times * own_px / spacing) for times in (_SAME, _ACROSS))
+    one_sided = [
+        moved[side] & ~_widened(moved[1 - side], same) & ~_widened(touched[1 - side], across)
+        for side in (0, 1)
+    ]
+    ends = np.linalg.norm(view.pixels[:, None] - view.pixels[[0, -1]], axis=2).min(axis=1)
+    may_be = seen & (ends > _FROM_ENDS * own_px)
+    return _widened((one_sided[0] | one_sided[1]) & may_be, same)
+
+
+def _sides(
+    ridge: Bool, stayed: Image, away: Float32, view: View, own_px: float
+) -> tuple[Bool, Bool]:
+    """(2, k) on which side of the curve's places ridges begin there, and those of them that have moved."""
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(ridge.astype(np.uint8))
-    shape = 2, len(view.pixels)
-    touched, moved = np.zeros(shape, bool), np.zeros(shape, bool)
+    touched, moved = np.zeros((2, 2, len(view.pixels)), bool)
     for label in range(1, count):
         left, top, width, height, _ = boxes[label]
         if max(width, height) < _LEAVES_PX - _OWN_PX:
@@ -145,15 +157,7 @@ def _branches(
         is_knot = length < _KNOT * own_px and length / 2 < away[box][piece].max()
         if length > _LONG * own_px and not is_knot:
             moved[is_left.astype(int), places] = True
-    spacing = max(polyline_length(view.pixels), 1.0) / (shape[1] - 1)
-    same, across = (round(times * own_px / spacing) for times in (_SAME, _ACROSS))
-    one_sided = [
-        moved[side] & ~_widened(moved[1 - side], same) & ~_widened(touched[1 - side], across)
-        for side in (0, 1)
-    ]
-    ends = np.linalg.norm(view.pixels[:, None] - view.pixels[[0, -1]], axis=2).min(axis=1)
-    may_be = seen & (ends > _FROM_ENDS * own_px)
-    return _widened((one_sided[0] | one_sided[1]) & may_be, same)
+    return touched, moved
 
 
 def _widened(flags: Bool, reach: int) -> Bool:
