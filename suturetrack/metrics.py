@@ -68,6 +68,11 @@ def polyline_tangents(points: Float64) -> Float64:
     return steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
+def nearest_index(points: Float64, place: Float64) -> int:
+    """Which of (k, dim) points is the nearest to a place (dim,)."""
+    return int(np.argmin(np.linalg.norm(points - place, axis=1)))
+
+
 def polyline_distances(points: Float64, polyline: Float64) -> Float64:
     """(k,) distances from (k, dim) points to the polyline through (m, dim) points."""
     return np.asarray(np.linalg.norm(polyline_offsets(points, polyline), axis=1))

@@ -12,6 +12,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationConfig, InitializationError, initialize
 from suturetrack.initialization.segments import find_ridges, nearest_segment
+from suturetrack.metrics import nearest_index
 from suturetrack.types import Float32, Float64, Image, InputError, Nurbs, RidgeField, Seed
 
 _SAMPLES = 400
@@ -57,7 +58,7 @@ def snap_pixel(
     if index is None:
         return None, candidates
     segment = ridges.segments[index]
-    return Snap(segment[np.argmin(np.linalg.norm(segment - pixel, axis=1))], segment), candidates
+    return Snap(segment[nearest_index(segment, pixel)], segment), candidates
 
 
 def snap_area(view: Float32, corners: Float64, config: InitializationConfig) -> Snap | None:

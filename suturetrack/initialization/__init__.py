@@ -27,6 +27,7 @@ from suturetrack.initialization.model import (
 )
 from suturetrack.initialization.segments import Ridges, find_ridges, nearest_segment, thread_scale
 from suturetrack.initialization.threads import Thread, follow_thread
+from suturetrack.metrics import nearest_index
 from suturetrack.nurbs import curve_from
 from suturetrack.types import Float32, Float64, Nurbs, RidgeField, Seed
 
@@ -224,7 +225,7 @@ def _growths(
         cost = np.full(right.magnitude.shape, np.inf, np.float32)
         return left, ViewGrowth(cost, (), np.empty((0, 2, 2)), ())
     pixels = found.pixels
-    there = pixels[np.argmin(np.linalg.norm(pixels[:, :2] - seed, axis=1)), 2:]
+    there = pixels[nearest_index(pixels[:, :2], seed), 2:]
     return left, grow_thread(found.right, there, config)
 
 

@@ -20,7 +20,7 @@ from suturetrack.initialization.model import PlacedDoubts, remaining
 from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.threads import Chain
-from suturetrack.metrics import arc_lengths, coverage, polyline_at, polyline_length
+from suturetrack.metrics import arc_lengths, coverage, nearest_index, polyline_at, polyline_length
 from suturetrack.types import Float64, Int64, Nurbs
 
 AGREED = 0.95
@@ -167,7 +167,7 @@ def _placed(
     line, counterpart = lines[view], lines[1 - view]
     placed = []
     for place, why, rest in doubts[view]:
-        at = int(np.argmin(np.linalg.norm(line - place, axis=1)))
+        at = nearest_index(line, place)
         there = counterpart[at]
         both = max(rest, min(_same(why, there, doubts[1 - view]), default=1.0))
         if why == SHARED or not _is_shared(place, line, counterpart, chains[1 - view].pixels):
@@ -185,7 +185,7 @@ def _confirmed(view: int, doubts: list[list[Doubt]], lines: tuple[Float64, Float
     as well: strands meet, or draw each other aside, in one view alone."""
     kept = []
     for doubt in doubts[view]:
-        there = lines[1 - view][np.argmin(np.linalg.norm(lines[view] - doubt.place, axis=1))]
+        there = lines[1 - view][nearest_index(lines[view], doubt.place)]
         if doubt.why not in FOREIGN or _same(doubt.why, there, doubts[1 - view]):
             kept.append(doubt)
     return kept

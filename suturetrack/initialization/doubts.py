@@ -149,21 +149,15 @@ def _runs_into_another(joints: Joints, tip: int, entries: list[int], ridges: Rid
     segment, own = inward(joints.segments, tip), {e // 2 for e in entries}
     end = segment[0]
     others = [s for k, s in enumerate(joints.segments) if k not in own]
-    if others and _nearest(np.concatenate(others), end)[1] < TOUCHING_PX:
+    if others and np.linalg.norm(np.concatenate(others) - end, axis=1).min() < TOUCHING_PX:
         return True
     passing = [joints.segments[k] for k in own - {tip // 2}]
     passing.append(segment[2 * ARM :])
     points = np.concatenate(passing)
     if not len(points):
         return False
-    at, distance = _nearest(points, end)
+    distance = np.linalg.norm(points - end, axis=1)
+    at = int(np.argmin(distance))
     between = ridges.sample(np.linspace(end, points[at], _GAP_SAMPLES))
     is_joined = between.min() > _GAP * min(between[0], between[-1])
-    return bool(distance < _SEPARATE_PX and is_joined)
-
-
-def _nearest(points: Float64, place: Float64) -> tuple[int, float]:
-    """Which of (k, 2) points is the nearest to a place, and how far it is."""
-    distance = np.linalg.norm(points - place, axis=1)
-    nearest = int(np.argmin(distance))
-    return nearest, float(distance[nearest])
+    return bool(distance[at] < _SEPARATE_PX and is_joined)

@@ -10,6 +10,7 @@ from suturetrack.initialization.model import InitializationConfig, ViewGrowth
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.threads import Thread
 from suturetrack.kernels import growth as kernel
+from suturetrack.metrics import nearest_index
 from suturetrack.types import Float32, Float64
 
 
@@ -44,7 +45,7 @@ def _grow(
         return float(cost[v, u])
 
     origin = pieces[first]
-    start(origin[np.argmin(np.linalg.norm(origin - seed, axis=1))], 0.0)
+    start(origin[nearest_index(origin, seed)], 0.0)
     ahead = list(pairwise(pieces[first:]))
     behind = [(b[::-1], a[::-1]) for a, b in pairwise(pieces[: first + 1])][::-1]
     for one, other in ahead + behind:

@@ -17,7 +17,7 @@ from suturetrack.initialization.threads import (
     follow_thread,
     without_faint_tails,
 )
-from suturetrack.metrics import coverage, polyline_distances
+from suturetrack.metrics import coverage, nearest_index, polyline_distances
 from suturetrack.types import Float64, RidgeField
 
 _UNMATCHED = 0.35
@@ -80,7 +80,7 @@ def find_thread(
         left = follow_thread(ridges[0], left.origin, config, depth)
         left = without_faint_tails(left, seed)
         matched = match(left.chain.pixels, field.left, field.right, at_infinity, 1)
-    there = matched.pixels[_closest(left.chain.pixels, seed)]
+    there = matched.pixels[nearest_index(left.chain.pixels, seed)]
     partner, _ = nearest_segment(ridges[1], there, np.inf)
     if partner is None:
         return Hypothesis(left, None, matched)
@@ -127,7 +127,3 @@ def _partings(one: Float64, other: Float64) -> Float64:
     """(k, 2) where the chain `one` leaves the other, or comes back to it."""
     apart = polyline_distances(one, other) > NEAR_PX
     return one[:-1][apart[1:] != apart[:-1]]
-
-
-def _closest(pixels: Float64, place: Float64) -> int:
-    return int(np.argmin(np.linalg.norm(pixels - place, axis=1)))

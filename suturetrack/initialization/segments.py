@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.kernels import crest, search
-from suturetrack.metrics import polyline_tangents
+from suturetrack.metrics import nearest_index, polyline_tangents
 from suturetrack.types import Float32, Float64, Int64
 
 ARM = 14
@@ -91,7 +91,7 @@ def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
 def nearest_segment(ridges: Ridges, seed: Float64, reach: float) -> tuple[int | None, Float64]:
     """The segment that a seed (2,) means, None if there is none within `reach`, and (k, 2) the
     nearest ridge points, one a segment."""
-    nearest = [s[np.argmin(np.linalg.norm(s - seed, axis=1))] for s in ridges.segments]
+    nearest = [s[nearest_index(s, seed)] for s in ridges.segments]
     if not nearest:
         return None, np.empty((0, 2))
     distance = np.linalg.norm(np.array(nearest) - seed, axis=1)
@@ -177,7 +177,7 @@ class _Neighbourhood:
 
     def nearest(self, near: Int64, place: Float64) -> tuple[int, int]:
         """The segment, and where on it, of that of some points that is nearest to a place."""
-        hit = near[np.argmin(np.linalg.norm(self._points[near] - place, axis=1))]
+        hit = near[nearest_index(self._points[near], place)]
         return int(self._owner[hit]), int(self._index[hit])
 
     def side_hit(self, k: int, at: int, arm: Float64) -> tuple[int, int] | None:

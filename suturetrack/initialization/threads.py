@@ -14,7 +14,7 @@ from suturetrack.initialization.joints import inward
 from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
-from suturetrack.metrics import arc_lengths, resample
+from suturetrack.metrics import arc_lengths, nearest_index, resample
 from suturetrack.types import Float64
 
 _FAINT = 0.4
@@ -85,7 +85,7 @@ def without_faint_tails(thread: Thread, place: Float64) -> Thread:
     there at a vein, or at another thread, that goes on in its direction."""
     chain = thread.chain
     strength = thread.ridges.sample(chain.pixels)
-    near = int(np.argmin(np.linalg.norm(chain.pixels - place, axis=1)))
+    near = nearest_index(chain.pixels, place)
     stop = _falls_at(strength, near)
     start = len(strength) - _falls_at(strength[::-1], len(strength) - 1 - near)
     if stop - start == len(strength):

@@ -6,7 +6,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, PlacedDoubts, remaining
-from suturetrack.metrics import resample
+from suturetrack.metrics import nearest_index, resample
 from suturetrack.nurbs import evaluate
 from suturetrack.tracking.sampling import length_of
 from suturetrack.types import Float64, Nurbs
@@ -196,7 +196,7 @@ def _apart(whole: Float64, part: Float64) -> float:
     """How far two lines, each (n, 2), are apart from end to end without what the second one lacks."""
     reach = round(_LACKING * len(whole))
     start, stop = (
-        int(np.argmin(np.linalg.norm(tip - end, axis=1)))
+        nearest_index(tip, end)
         for tip, end in ((whole[:reach], part[0]), (whole[: -reach - 1 : -1], part[-1]))
     )
     there = resample(whole[start : len(whole) - stop], _PLACES)

@@ -9,6 +9,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
+from suturetrack.metrics import nearest_index
 from suturetrack.nurbs import evaluate
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.images import Images
@@ -356,7 +357,7 @@ def _nearest(curve: Nurbs, seed: Seed, rig: StereoRig) -> float:
     points = evaluate(curve, s)
     places = points if seed.pixel is None else rig.project_raw(points)[0]
     wanted = np.array(seed.point if seed.pixel is None else seed.pixel)
-    return float(s[np.argmin(np.linalg.norm(places - wanted, axis=1))])
+    return float(s[nearest_index(places, wanted)])
 
 
 def not_found(name: str, stamp: Stamp, events: tuple[str, ...]) -> ThreadState:
