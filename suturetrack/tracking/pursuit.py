@@ -36,11 +36,9 @@ class Pursuit:
         is_fresh: bool = False,
     ) -> None:
         self._seed, self._setup = seed, setup
-        self.follower = setup.follower(found, field)
+        self.follower = setup.follower(found, field, before)
         self.found = found
         """What is followed, as it was found."""
-        if before is not None:
-            self.follower.remember(before, is_sure=found.confidence >= SURE)
         self._found_at = (field.stamp.capture_ns, found.curve) if is_fresh else None
 
     def step(self, field: RidgeField, others: Neighbours) -> ThreadState:
@@ -72,8 +70,7 @@ class Pursuit:
             return None
         if state.status is Status.OCCLUDED and found.confidence < SURE:
             return None
-        follower = self._setup.follower(found, field)
-        follower.remember(old, is_sure=found.confidence >= SURE)
+        follower = self._setup.follower(found, field, old)
         again = follower.step(field, self._seed.thread, others)
         if again.status is not Status.TRACKING:
             return None

@@ -22,6 +22,7 @@ from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.length import has_length
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import Neighbours, Strand
+from suturetrack.tracking.sureness import SURE
 from suturetrack.types import Bool, Float64, Nurbs, RidgeField, Seed
 
 _PLACES = 24
@@ -47,10 +48,18 @@ class Setup:
         """The thread through the seed; raises as `initialize`."""
         return initialize(field, self.rig, seed, self.initialization)
 
-    def follower(self, found: Initialization, field: RidgeField) -> Follower:
-        """Follows what was found in the field, on the rows where the right view showed it."""
-        rig = self.rig.with_row_offset(found.row_offset_px)
-        return Follower(found.curve, field, rig, self.tracking)
+    def rig_of(self, found: Initialization) -> StereoRig:
+        """With the rows on which the right view showed what was found."""
+        return self.rig.with_row_offset(found.row_offset_px)
+
+    def follower(
+        self, found: Initialization, field: RidgeField, before: Follower | None = None
+    ) -> Follower:
+        """Follows what was found in the field; `before` is who followed it before."""
+        follower = Follower(found.curve, field, self.rig_of(found), self.tracking)
+        if before is not None:
+            follower.remember(before, is_sure=found.confidence >= SURE)
+        return follower
 
 
 def find_again(

@@ -43,7 +43,7 @@ class FromSeed:
 
     def beside(self, others: Neighbours, found: Initialization) -> Found:
         """What was found, which may be one of the other threads."""
-        return doubting_ends(found, others, self.setup.rig.with_row_offset(found.row_offset_px))
+        return doubting_ends(found, others, self.setup.rig_of(found))
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows the first curve."""
@@ -110,7 +110,7 @@ class Closer:
 
     def beside(self, others: Neighbours, found: Initialization) -> Found:
         """What was found, unless it is one of the other threads."""
-        return _none_of(others, found, self.setup.rig.with_row_offset(found.row_offset_px))
+        return _none_of(others, found, self.setup.rig_of(found))
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows what this look found."""
