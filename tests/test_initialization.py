@@ -12,9 +12,9 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
 from suturetrack.initialization.arms import Arms
+from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.ends import read_end
-from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.segments import find_ridges, split_at_touches
 from suturetrack.initialization.topology import merge_ends
 from suturetrack.metrics import curve_error, polyline_distances, polyline_length

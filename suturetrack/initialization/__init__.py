@@ -9,6 +9,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.confidence import judge
+from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.crest import View
 from suturetrack.initialization.ends import move_end, read_end
 from suturetrack.initialization.fitting import refine
@@ -16,10 +17,9 @@ from suturetrack.initialization.growth import grow_thread
 from suturetrack.initialization.hypotheses import Hypothesis, find_thread
 from suturetrack.initialization.knots import fit_marks, image_parameters
 from suturetrack.initialization.matching import Match, match, raised, row_offset
-from suturetrack.initialization.model import (
+from suturetrack.initialization.result import (
     Growth,
     Initialization,
-    InitializationConfig,
     InitializationError,
     PlacedDoubts,
     ViewGrowth,

@@ -16,7 +16,7 @@ from suturetrack.initialization.doubts import (
     SHARP,
     Doubt,
 )
-from suturetrack.initialization.model import PlacedDoubts, remaining
+from suturetrack.initialization.result import PlacedDoubts, remaining
 from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.threads import Chain

@@ -6,7 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from suturetrack.initialization.model import InitializationConfig, ViewGrowth
+from suturetrack.initialization.config import InitializationConfig
+from suturetrack.initialization.result import ViewGrowth
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.threads import Thread
 from suturetrack.kernels import growth as kernel

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.initialization.confidence import AGREED, NEAR_PX, clarity
+from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.matching import Match, match
-from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.segments import Ridges, nearest_segment
 from suturetrack.initialization.threads import (
     Chain,

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
-from suturetrack.initialization.model import InitializationConfig
+from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.kernels import search
 from suturetrack.types import Bool, Float64, Int64

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 from scipy.spatial import cKDTree
 
-from suturetrack.initialization.model import InitializationConfig
+from suturetrack.initialization.config import InitializationConfig
 from suturetrack.kernels import crest, search
 from suturetrack.metrics import nearest_index, polyline_tangents
 from suturetrack.types import Float32, Float64, Int64

@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.doubts import FADES, Doubt, doubts
 from suturetrack.initialization.joints import inward
-from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
 from suturetrack.metrics import arc_lengths, nearest_index, resample

@@ -8,10 +8,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from suturetrack.initialization.arms import REACH, Arms
+from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.hairpins import double_stubs
 from suturetrack.initialization.joints import Joints, Pair, inward
-from suturetrack.initialization.model import InitializationConfig
 from suturetrack.initialization.pricing import FREE_END, HIGHEST, Merge, price_merges
 from suturetrack.initialization.segments import ARM, Ridges
 

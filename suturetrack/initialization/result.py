@@ -1,4 +1,4 @@
-"""What the initialisation takes and gives back."""
+"""What comes of the initialisation."""
 
 from __future__ import annotations
 
@@ -15,24 +15,6 @@ confidence."""
 def remaining(doubts: PlacedDoubts) -> float:
     """What doubts leave of the confidence: those of the view that has the graver ones count."""
     return min(math.prod(rest for _, rest in view) for view in doubts)
-
-
-@dataclass(frozen=True)
-class InitializationConfig:
-    """How one seed becomes a curve (Section V)."""
-
-    rho: float = 2.0
-    """Exponent of eq. (3): how strongly the growth prefers clear ridges."""
-    low: float = 0.12
-    """Length of the field's vectors below which a pixel is background."""
-    high: float = 0.4
-    """Length that a stretch of thread must reach somewhere."""
-    step_px: float = 6.0
-    """Step size: distance between the stereo points that are marked along the thread, px."""
-    snap_px: float = 8.0
-    """How far from the thread the seed may be, px."""
-    gap_px: float = 25.0
-    """Longest gap in the ridge that is bridged, px."""
 
 
 @dataclass(frozen=True, eq=False)
