@@ -86,11 +86,12 @@ class Follower:
         self.known_length = KnownLength(length_of(curve))
         self._lost = False
         self._certain_ns = now
+        """When it was certain last where the thread runs, and for a moment before."""
         self._doubted_ns = self._regrown_ns = -(1 << 62)
         self._drift = Drift()
         self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
-        self._share = 1.0
+        self._share_seen = 1.0
         self.is_crowded = self.makes_detour = False
         """Whether other ridges run beside the thread, and whether they have made the curve too long."""
         self._comes_in = False
@@ -286,11 +287,11 @@ class Follower:
             model.curve,
             predicted,
             images,
-            self._share,
+            self._share_seen,
             self.config,
             neighbours.shown_in(images),
         )
-        self._share = best.share
+        self._share_seen = best.share
         # What was just drawn out may have been drawn out in depth.
         model.curve = best.without_half_seen_tips() if self._leaps.any() else best.fit.curve
         self._leaps = np.zeros(2, bool)

@@ -70,8 +70,10 @@ class Thread:
         self._known: Follower | None = None
         """As it was who followed the thread when that was sure last."""
         self._longest = 0.0
+        """Length of a curve that was found with some hope, at most."""
         self._seeded_at = 0.5
-        self._rest = self._failures = self._looks_in_vain = 0
+        """Parameter of the curve at which it was found."""
+        self._fields_to_rest = self._attempts = self._looks_in_vain = 0
 
     @property
     def is_held(self) -> bool:
@@ -131,7 +133,7 @@ class Thread:
             self._strangers = self._strangers.of_another()
         self._come_to(state)
         if not self.is_astray:
-            self._rest = self._failures = 0
+            self._fields_to_rest = self._attempts = 0
 
     def _look_for_strangers(
         self, state: ThreadState, field: RidgeField, others: Neighbours
@@ -179,19 +181,19 @@ class Thread:
         return FromSeed(self._seed, self._setup, self._toward)
 
     def _search_again(self, is_beside: bool) -> Search | None:
-        if self._rest > 0:
-            self._rest -= 1
+        if self._fields_to_rest > 0:
+            self._fields_to_rest -= 1
             return None
-        self._rest = _REST << min(max(self._failures - _QUICK_ATTEMPTS, 0), _RAREST)
-        self._failures += 1
-        turn = self._failures - 1 if is_beside else None
+        self._fields_to_rest = _REST << min(max(self._attempts - _QUICK_ATTEMPTS, 0), _RAREST)
+        self._attempts += 1
+        turn = self._attempts - 1 if is_beside else None
         if self.follower is not None:
             last, rig = self.follower.last_good, self.follower.rig
-            is_known = self._failures <= _ATTEMPTS and self._looks_in_vain < _LOOKS
+            is_known = self._attempts <= _ATTEMPTS and self._looks_in_vain < _LOOKS
             before = self._who_knows_its_length() if is_known else ()
             return Again(self._seed, self._setup, last, lengths(before), rig, before, turn)
         assert self._state.curve is not None
-        known = (self._state.length,) if self._failures <= _QUICK_ATTEMPTS else ()
+        known = (self._state.length,) if self._attempts <= _QUICK_ATTEMPTS else ()
         return Again(self._seed, self._setup, self._state.curve, known, self._setup.rig, (), turn)
 
     def _search_closer(self, now_ns: int) -> Search | None:
@@ -224,7 +226,7 @@ class Thread:
         was_sure, before = self._is_sure, self._pursuit
         outcome, search = look.outcome(), look.search
         if isinstance(search, Again):
-            self._rest = max(self._rest - look.fields + 1, 0)
+            self._fields_to_rest = max(self._fields_to_rest - look.fields + 1, 0)
         if isinstance(search, FromSeed):
             self._take_first(outcome, look.fields)
         elif outcome.pursuit is None or outcome.pursuit.lies_on(others):
@@ -321,7 +323,7 @@ class Thread:
             self._setup.rig,
             self._sureness,
         )
-        self._rest = self._failures = 0
+        self._fields_to_rest = self._attempts = 0
         if not self._sureness.is_hopeless:
             self._longest = max(self._longest, state.length)
         self._come_to(replace(state, events=(event, *state.events)))
