@@ -753,14 +753,41 @@ def test_of_threads_found_one_after_another_the_surest_counts(
     assert states["b"] is (Status.TRACKING if is_surer else Status.OCCLUDED)
 
 
-def test_names_of_one_thread_do_not_doubt_each_other(rig: StereoRig) -> None:
+def test_a_thread_that_is_tracked_takes_no_other_name(rig: StereoRig) -> None:
     points = pair(0)[0]
-    tracker = Tracker(rig)
-    fields = [paint(rig, [points], i) for i in range(DELAY + 4)]
+    tracker = Tracker(rig, TrackingConfig(patience=3))
+    fields = [paint(rig, [points], i) for i in range(4 * DELAY)]
     for name in "ab":
         tracker.seed(seed_on(rig, points, name))
-    tracker.step(fields[0])
+    steps = [tracker.step(fields[0])]
     tracker.seed(seed_on(rig, points, "c"))
+    steps += [tracker.step(field) for field in fields[1:]]
+    for name in "bc":
+        (refusal, *_) = (s.initializations[name] for s in steps if name in s.initializations)
+        assert isinstance(refusal, InitializationError)
+        assert refusal.reason == "that is thread a already"
+        assert not tracker.is_sought(name)
+    statuses = [state.status for state in steps[-1].states]
+    assert statuses == [Status.TRACKING, Status.LOST, Status.LOST]
+    assert all(step.states[0].status is Status.TRACKING for step in steps)
+
+
+@pytest.mark.parametrize("away_px", [6, 15])
+def test_a_thread_is_seeded_near_where_it_crosses_a_tracked_one(
+    rig: StereoRig, away_px: int
+) -> None:
+    x = np.linspace(-25, 25, 600)
+    first = np.c_[x, 0.01 * x**2, np.full(600, 200.0)]
+    second = np.c_[0.02 * x**2 - 3, x, np.full(600, 196.0)]
+    tracker = Tracker(rig)
+    fields = [paint(rig, [first, second], i) for i in range(DELAY + 4)]
+    tracker.seed(seed_on(rig, first[:100], "a"))
+    tracker.step(fields[0])
+    pixels = rig.project_raw(second)[0]
+    away = np.abs(np.hypot(*(pixels - pixels[len(x) // 2]).T) - away_px)
+    u, v = pixels[np.argmin(away)]
+    tracker.seed(Seed("b", pixel=(float(u), float(v))))
     for field in fields[1:]:
         states = tracker.step(field).states
-    assert [state.status for state in states] == [Status.TRACKING] * 3
+    assert [state.status for state in states] == [Status.TRACKING] * 2
+    assert rms(states[1], second) < 0.15

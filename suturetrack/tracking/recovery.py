@@ -110,6 +110,14 @@ def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:
     return bool(np.mean(_shared(curve, others, rig, search.APART_PX)) > _SHARED)
 
 
+def known_as(found: Initialization, others: Neighbours, rig: StereoRig) -> str:
+    """The name of the tracked thread on which what was found lies from end to end; empty for none."""
+    for name, other in others.tracked.items():
+        if _shared(found.curve, other, rig, _BESIDE_PX).mean() > _SAME:
+            return name
+    return ""
+
+
 def doubting_ends(found: Initialization, others: Neighbours, rig: StereoRig) -> Initialization:
     """The look, which is not sure by itself where an end runs on along another thread that is as sure.
 

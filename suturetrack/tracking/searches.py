@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.tracking.follower import Follower
@@ -14,6 +16,7 @@ from suturetrack.tracking.recovery import (
     directed,
     doubting_ends,
     find_again,
+    known_as,
     lies_on,
     starts_on,
 )
@@ -42,8 +45,12 @@ class FromSeed:
         return found if self.toward is None else directed(found, self.toward)
 
     def beside(self, others: Neighbours, found: Initialization) -> Found:
-        """What was found, which may be one of the other threads."""
-        return doubting_ends(found, others, self.setup.rig_of(found))
+        """What was found, unless it is a thread that is tracked under another name."""
+        rig = self.setup.rig_of(found)
+        if name := known_as(found, others, rig):
+            reason = f"that is thread {name} already"
+            return InitializationError(reason, np.empty((0, 2)), found.growth)
+        return doubting_ends(found, others, rig)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
         """Follows the first curve."""

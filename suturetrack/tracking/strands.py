@@ -73,6 +73,8 @@ class Neighbours:
     """One by one, in the left and in the right image."""
     confidences: tuple[float, ...] = ()
     """How sure it is of each that it is one; without them, of all."""
+    names: tuple[str, ...] = ()
+    """Of each that is tracked; empty for others, and without them of all."""
 
     def as_sure_as(self, confidence: float) -> Neighbours:
         """Those of which it is at least as sure."""
@@ -80,6 +82,12 @@ class Neighbours:
             return self
         both = zip(self.threads, self.confidences, strict=True)
         return Neighbours(tuple(thread for thread, sure in both if sure >= confidence))
+
+    @property
+    def tracked(self) -> dict[str, Neighbours]:
+        """Each that is tracked, alone, by name."""
+        both = zip(self.names, self.threads, strict=False)
+        return {name: Neighbours((thread,)) for name, thread in both if name}
 
     @cached_property
     def both(self) -> tuple[Strand, Strand]:

@@ -81,6 +81,11 @@ class Thread:
         return self._state.status is not Status.LOST
 
     @property
+    def is_tracked(self) -> bool:
+        """Whether it is held for sure, and most of it is seen."""
+        return self._state.status is Status.TRACKING
+
+    @property
     def is_astray(self) -> bool:
         """Whether it has to be found again."""
         is_doubtful = self.follower is not None and self.follower.is_doubtful

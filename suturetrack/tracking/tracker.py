@@ -177,12 +177,15 @@ class Tracker:
     def _others(self, thread: Thread, stamp: Stamp) -> Neighbours:
         """The strands of the other threads that are held."""
         held = [
-            (other.follower.strands(stamp.capture_ns), other.confidence)
+            (
+                other.follower.strands(stamp.capture_ns),
+                other.confidence,
+                other.name if other.is_tracked else "",
+            )
             for other in self._threads.values()
             if other is not thread and other.follower is not None and other.is_held
         ]
-        strands, confidences = zip(*held, strict=True) if held else ((), ())
-        return Neighbours(strands, confidences)
+        return Neighbours(*zip(*held, strict=True))
 
     def _drop_look(self, thread: str) -> None:
         if self._look is not None and self._look.thread == thread:
