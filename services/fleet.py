@@ -263,13 +263,14 @@ class Fleet:
         return all(held)
 
     def complaint(self) -> str | None:
-        """Why the run failed; None when every process ended as it should."""
+        """Why the run failed; None when every process ended as it should. To be asked after `stop`."""
         for post in self._posts:
             back = not post.starts or self._pulse.is_ready(post.child.name, post.starts)
             if post is not self._failed and (post.is_vacant or not back):
                 return f"the {post.child.name} died, and the run ended before it was back"
         if self._failed is None:
-            return None
+            refused = (post.child for post in self._posts if post.child.was_refused)
+            return next((child.complaint() for child in refused), None)
         complaint = self._failed.child.complaint()
         if self._budget and not self._failed.child.was_refused:
             complaint += (

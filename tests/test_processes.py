@@ -123,6 +123,17 @@ def test_a_run_in_lock_step_is_recorded_whole_and_leaves_nothing_behind(
     ]
 
 
+def test_a_seed_that_footage_was_too_short_to_find_fails_the_run(
+    start: Callable[..., subprocess.Popen[str]],
+    pairs: tuple[Path, tuple[float, float]],
+    tmp_path: Path,
+) -> None:
+    process = start(*run_pairs((pairs[0], (20.0, 20.0)), tmp_path / "a"))
+    _, err = process.communicate(timeout=90)
+    assert process.returncode == 1
+    assert err.startswith("suturetrack run: seed (20.0, 20.0): no thread within 8 px of the seed")
+
+
 def test_the_source_may_start_first(start: Callable[..., subprocess.Popen[str]]) -> None:
     """The launcher starts the tracker first; processes that depend on nobody's order do this too."""
     options = ("--lockstep", "--rig", "test")
