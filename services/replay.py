@@ -146,7 +146,7 @@ def _converted(plain: dict[str, Any], where: str) -> Parameters:
     try:
         return msgspec.convert(plain, Parameters)
     except msgspec.ValidationError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {error.__cause__ or error}") from error
 
 
 def _beside(run_dir: Path) -> Path:

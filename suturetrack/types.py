@@ -25,6 +25,21 @@ class InputError(ValueError):
     """The user's input is at fault; the message is one line: what is wrong, what would be right."""
 
 
+def check_ranges(config: object, prefix: str, **ranges: tuple[float, float]) -> None:
+    """Raises InputError for a parameter, or a number of several, outside its range; None is in all.
+
+    Args:
+        prefix: what the options of the configuration begin with.
+        ranges: by parameter, the least and the greatest value.
+    """
+    for name, (least, greatest) in ranges.items():
+        value = getattr(config, name)
+        numbers = value if isinstance(value, tuple) else () if value is None else (value,)
+        if not all(least <= number <= greatest for number in numbers):
+            given, option = " ".join(map(str, numbers)), name.replace("_", "-")
+            raise InputError(f"--{prefix}.{option} {given}: use {least:g} to {greatest:g}")
+
+
 @dataclass(frozen=True, order=True)
 class Stamp:
     """Which frame a value belongs to; given by the source and passed on unchanged by every stage."""

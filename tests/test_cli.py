@@ -121,6 +121,24 @@ def test_bad_input_gets_one_clear_line_and_nothing_is_made(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "least", "greatest"),
+    [
+        ("initialization.step-px", "0.0", "1", "100"),
+        ("initialization.low", "nan", "0.01", "0.99"),
+        ("tracking.iterations", "-3", "1", "100"),
+        ("tracking.paper.gain", "inf", "0", "1000"),
+        ("segmentation.sigmas", "1.0 nan", "0.3", "20"),
+    ],
+)
+def test_a_parameter_out_of_its_range_is_named(
+    call: Call, option: str, value: str, least: str, greatest: str
+) -> None:
+    status, err = call("run", "--source", STAGE, f"--{option}", *value.split())
+    assert status == 2
+    assert f"--{option} {value}: use {least} to {greatest}" in err
+
+
 def test_a_video_needs_a_calibration(call: Call, tmp_path: Path) -> None:
     assert "--calibration FILE is needed" in complaint(call("run", "--source", tmp_path))
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from suturetrack.types import check_ranges
+
 
 @dataclass(frozen=True)
 class InitializationConfig:
@@ -21,3 +23,15 @@ class InitializationConfig:
     """How far from the thread the seed may be, px."""
     gap_px: float = 25.0
     """Longest gap in the ridge that is bridged, px."""
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            "initialization",
+            rho=(0.1, 10),
+            low=(0.01, 0.99),
+            high=(0.01, 0.99),
+            step_px=(1, 100),
+            snap_px=(1, 100),
+            gap_px=(1, 500),
+        )

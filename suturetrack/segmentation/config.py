@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from suturetrack.types import InputError
+from suturetrack.types import InputError, check_ranges
 
 Channel = Literal["learned", "gray", "blue", "green", "red"]
 Polarity = Literal["auto", "dark", "bright", "both"]
@@ -37,9 +37,13 @@ class SegmentationConfig:
     """Whether what was learned of a thread follows, once a second, how it looks along its curve."""
 
     def __post_init__(self) -> None:
-        if not all(sigma > 0 for sigma in (self.beta, self.blur, *(self.sigmas or (1.0,)))):
-            raise InputError("segmentation: sigmas, beta and blur must be positive")
-        if self.sigmas == () or (self.c is not None and not self.c > 0):
-            raise InputError(
-                "segmentation: give sigmas and a positive c, or None for automatic ones"
-            )
+        if self.sigmas == ():
+            raise InputError("--segmentation.sigmas: give at least one, or None")
+        check_ranges(
+            self,
+            "segmentation",
+            sigmas=(0.3, 20),
+            beta=(0.01, 100),
+            c=(0.01, 10_000),
+            blur=(0.1, 20),
+        )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from suturetrack.types import check_ranges
+
 
 @dataclass(frozen=True)
 class PaperConfig:
@@ -29,6 +31,21 @@ class PaperConfig:
     """Longest step of a point in one update."""
     spacing_px: tuple[float, float] = (10.0, 26.0)
     """Range of the distances of neighbouring control points: beyond it they are spaced evenly again."""
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            "tracking.paper",
+            gain=(0, 1000),
+            end_gain=(0, 1000),
+            iterations=(1, 1000),
+            samples_per_control_point=(1, 50),
+            search_px=(1, 100),
+            flat_px=(0, 100),
+            flat_slope=(0, 100),
+            largest_step_px=(0.01, 100),
+            spacing_px=(2, 1000),
+        )
 
 
 @dataclass(frozen=True)
@@ -58,3 +75,17 @@ class TrackingConfig:
     """Parameters of the method `paper`."""
     patience: int = 30
     """Fields in which the thread is looked for after a seed before it is given up."""
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            "tracking",
+            search_px=(1, 100),
+            iterations=(1, 100),
+            noise_px=(0.001, 10),
+            drift_px=(0.01, 100),
+            smoothing=(0, 1e6),
+            stretch=(0.0001, 10),
+            samples_per_span=(2, 50),
+            patience=(1, 100_000),
+        )
