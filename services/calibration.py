@@ -17,12 +17,13 @@ from services.calibration_check import (
     epipolar_error,
     field_of_view,
     pixel_convention,
+    thread_is_swapped,
 )
 from services.sources.footage import read_image
 from services.sources.rig import check_size, open_rig
 from services.tables import new_table, report_console
 from suturetrack.camera import StereoRig
-from suturetrack.types import InputError
+from suturetrack.types import Image, InputError
 
 _GOOD_PX, _BAD_PX = 0.5, 2.0
 """Median distance between matched rows that is fine, and that nothing can be tracked with."""
@@ -67,9 +68,12 @@ def run(config: CalibrationConfig) -> None:
     warnings = doubts(rig)
     failure = None
     if config.images is not None:
-        found = _measure(rig, config)
+        left, right = _read(config.images, config.file, rig)
+        found = epipolar_error(rig, left, right)
         _rows(found, rig, console)
         failure, more = _judge(found, rig)
+        if _is_blind(found) and thread_is_swapped(rig, left, right):
+            failure = "the thread lies where only swapped cameras see it; swap left and right"
         warnings += more
     for warning in warnings:
         console.print(f"[yellow]warning:[/] {warning}", soft_wrap=True, highlight=False)
@@ -79,13 +83,12 @@ def run(config: CalibrationConfig) -> None:
         console.print("Nothing looks wrong.")
 
 
-def _measure(rig: StereoRig, config: CalibrationConfig) -> Epipolar | None:
-    assert config.images is not None
-    left, right = (read_image(path) for path in config.images)
-    for path, image in zip(config.images, (left, right), strict=True):
+def _read(paths: tuple[Path, Path], calibration: Path, rig: StereoRig) -> tuple[Image, Image]:
+    left, right = (read_image(path) for path in paths)
+    for path, image in zip(paths, (left, right), strict=True):
         size = image.shape[1], image.shape[0]
-        check_size(size, rig, f"image {path}", f"calibration {config.file}")
-    return epipolar_error(rig, left, right)
+        check_size(size, rig, f"image {path}", f"calibration {calibration}")
+    return left, right
 
 
 def _describe(rig: StereoRig, unit: str | None, console: Console) -> None:
@@ -143,6 +146,11 @@ def _rows(found: Epipolar | None, rig: StereoRig, console: Console) -> None:
     console.print(table)
 
 
+def _is_blind(found: Epipolar | None) -> bool:
+    """Whether features tell nothing of the side on which the cameras are."""
+    return found is None or bool(np.isinf(found.distance))
+
+
 def _judge(found: Epipolar | None, rig: StereoRig) -> tuple[str | None, list[str]]:
     """Why the images rule the calibration out, and what else they make doubtful."""
     if found is None:
@@ -161,6 +169,11 @@ def _judge(found: Epipolar | None, rig: StereoRig) -> tuple[str | None, list[str
         doubtful.append(
             f"rows differ by {found.median_px:.2f} px, good is below {_GOOD_PX:g}; a constant shift of "
             f"half a pixel ({found.shift_px:+.2f} here) comes from another way of counting pixels"
+        )
+    if _is_blind(found):
+        doubtful.append(
+            "the matched features have no disparity: they are dirt or compression, or far away; take "
+            "images of a near scene with more texture"
         )
     distance_mm = found.distance * rig.metres_per_unit * 1000
     if np.isfinite(distance_mm) and not 5 <= distance_mm <= 5000:

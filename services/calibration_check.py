@@ -8,7 +8,10 @@ import cv2
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.types import Bool, Float64, Image
+from suturetrack.initialization import InitializationError, initialize
+from suturetrack.segmentation import Segmenter
+from suturetrack.snapping import pixel_in_area
+from suturetrack.types import Bool, Float64, Image, InputError, Seed, Stamp, StereoFrame
 
 FEWEST_MATCHES = 20
 _LARGEST_RATIO = 0.75
@@ -16,6 +19,8 @@ _LARGEST_RATIO = 0.75
 _FEWEST_AGREEING = 0.5
 """Share of the matches that must agree before they are believed."""
 _AGREEING_PX = 2.0
+_LEAST_DISPARITY_PX = 0.5
+"""Features with less belong to the images, as compression and dirt do, or lie too far away to tell."""
 _FEATURES = 2000
 """The strongest ones of each image are matched."""
 _TRIALS = 300
@@ -34,7 +39,8 @@ class Epipolar:
     swapped: bool
     """Whether most features lie on the side on which only the other camera could see them."""
     distance: float
-    """Median distance of the features from the cameras, calibration's unit; nan when swapped."""
+    """Median distance of the features from the cameras, calibration's unit; nan when swapped, infinite
+    without a disparity."""
 
 
 def epipolar_error(rig: StereoRig, left: Image, right: Image) -> Epipolar | None:
@@ -57,15 +63,36 @@ def epipolar_error(rig: StereoRig, left: Image, right: Image) -> Epipolar | None
         return None
     p, q, rows = p[good], q[good], rows[good]
     disparity = (p[:, 0] - rig.left.projection[0, 2]) - (q[:, 0] - rig.right.projection[0, 2])
-    swapped = bool(np.median(disparity) < 0)
+    middle = float(np.median(disparity))
+    distance = np.nan if middle < -_LEAST_DISPARITY_PX else np.inf
+    if middle > _LEAST_DISPARITY_PX:
+        distance = float(np.median(rig.triangulate(p, q)[:, 2]))
     return Epipolar(
         matches=len(rows),
         shift_px=float(np.median(rows)),
         median_px=float(np.median(np.abs(rows))),
         p95_px=float(np.percentile(np.abs(rows), 95)),
-        swapped=swapped,
-        distance=np.nan if swapped else float(np.median(rig.triangulate(p, q)[:, 2])),
+        swapped=middle < -_LEAST_DISPARITY_PX,
+        distance=distance,
     )
+
+
+def thread_is_swapped(rig: StereoRig, left: Image, right: Image) -> bool:
+    """Whether the right image shows the clearest thread of the left one where only swapped cameras would.
+
+    Args:
+        rig, left, right: as `epipolar_error`.
+    """
+    frame, segmenter = StereoFrame(Stamp(0, 0, 0), left, right), Segmenter(rig)
+    try:
+        seed = Seed(pixel=pixel_in_area(segmenter.step(frame), rig, (0.0, 0.0, *rig.image_size)))
+        segmenter.learn(frame, seed)
+        initialize(segmenter.step(frame), rig, seed)
+    except InitializationError as error:
+        return error.swapped
+    except InputError:  # Nothing looks like thread.
+        pass
+    return False
 
 
 def depth_step(rig: StereoRig, distance: float) -> float:

@@ -19,6 +19,7 @@ from services.calibration_check import (
 )
 from suturetrack.calibration import save_calibration
 from suturetrack.camera import StereoRig
+from suturetrack.stage import open_scene
 from suturetrack.types import Image, InputError
 from tests.conftest import make_rig
 
@@ -115,6 +116,22 @@ def test_images_that_contradict_the_calibration_fail_it(
     with pytest.raises(InputError, match=words) as caught:
         check(tmp_path, rig, images)
     assert "\n" not in str(caught.value)
+
+
+def test_a_thread_tells_swapped_images_where_features_do_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both sensors have the same fixed pattern, which has no disparity."""
+    scene = open_scene("figure8-107", seed=3)
+    pattern = cv2.resize(texture(), (640, 480))
+    left, right = (
+        np.where(image.mean(axis=2) < 80, image.mean(axis=2), 150 + pattern / 8).astype(np.uint8)
+        for image in scene.render(0)
+    )
+    check(tmp_path, scene.rig, (left, right))
+    assert "no disparity" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(InputError, match="the thread lies where only swapped cameras see it"):
+        check(tmp_path, scene.rig, (right, left))
 
 
 def test_images_of_another_size_need_a_scale(tmp_path: Path, rig: StereoRig) -> None:

@@ -82,7 +82,8 @@ def _initialize_from_afar(
         found = _initialize(reduced, left, rig.reduced(scale), pixel / scale, config, scale)
     except InitializationError as error:
         growth = None if error.growth is None else error.growth.enlarged(scale, field.left.shape)
-        raise InitializationError(error.reason, scale * error.candidates, growth) from None
+        candidates = scale * error.candidates
+        raise InitializationError(error.reason, candidates, growth, swapped=error.swapped) from None
     return replace(
         found,
         reprojection_px=scale * found.reprojection_px,
@@ -171,8 +172,9 @@ def _reconstruct(start: _Start, field: RidgeField) -> Initialization:
         reason = f"the ridge at the seed is only {start.scale * len(found.pixels)} px long"
         raise InitializationError(reason, start.candidates, growth)
     if not _is_matched(found.matched):
-        swapped = match(found.left.chain.pixels, field.left, field.right, infinity, -1)
-        raise InitializationError(_no_match(swapped), start.candidates, growth)
+        other = match(found.left.chain.pixels, field.left, field.right, infinity, -1)
+        swapped = _is_matched(other)
+        raise InitializationError(_no_match(swapped), start.candidates, growth, swapped=swapped)
     views = (
         View(field.left, found.left.others),
         View(field.right, np.empty((0, 2)) if found.right is None else found.right.others),
@@ -233,9 +235,9 @@ def _is_matched(matched: Match) -> bool:
     return bool(np.median(matched.response) >= _LEAST_MATCH)
 
 
-def _no_match(swapped: Match) -> str:
+def _no_match(swapped: bool) -> str:
     reason = "the right view shows no thread along the epipolar lines of the left one"
-    if _is_matched(swapped):
+    if swapped:
         reason += ", but it does on the other side: left and right are swapped"
     return reason
 

@@ -79,9 +79,18 @@ class Initialization:
 class InitializationError(Exception):
     """No thread could be found; the message is the reason."""
 
-    def __init__(self, reason: str, candidates: Float64, growth: Growth | None = None) -> None:
+    def __init__(
+        self,
+        reason: str,
+        candidates: Float64,
+        growth: Growth | None = None,
+        *,
+        swapped: bool = False,
+    ) -> None:
         super().__init__(reason)
         self.reason = reason
         self.candidates = candidates
         """(k, 2) ridge pixels nearest to the seed, rectified left view."""
         self.growth = growth
+        self.swapped = swapped
+        """Whether the right view shows it where only swapped cameras would."""
