@@ -60,11 +60,23 @@ class SeedDesk:
 
     def _open(self, seed: Seed, request: Request[Seed, SeedReply] | None) -> _Case:
         self._rig.locate(seed)
+        if seed.point is not None:
+            self._check_depth(seed.point[2])
         before = self._cases.pop(seed.thread, None)
         if before is not None:
             _answer(before, SeedReply(seed.thread, False, "another seed took its place"))
         case = self._cases[seed.thread] = _Case(seed, request)
         return case
+
+    def _check_depth(self, depth: float) -> None:
+        """Raises InputError for what is far out of what the cameras see, as millimetres for metres are."""
+        nearest, farthest = self._rig.depths
+        if not nearest <= depth <= farthest:
+            at, least, most = (d * self._rig.metres_per_unit for d in (depth, nearest, farthest))
+            raise InputError(
+                f"the seed is {at:.3g} m away, but the cameras see from {least:.3g} to {most:.3g} m; "
+                "a point is in metres"
+            )
 
     def resume(self, given: Iterable[Seed]) -> None:
         """Takes up the threads of a tracker that died: from their last states, else from their seeds."""

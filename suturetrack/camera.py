@@ -15,6 +15,8 @@ Pixels = TypeVar("Pixels", Image, Float32)
 
 LARGEST_SIDE = 8192
 """Of an image, px."""
+_LEAST_DISPARITY_PX = 2.0
+"""Below it, a pixel more or less is half the depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +135,13 @@ class StereoRig:
     def disparity_at_infinity(self) -> float:
         """u_left - u_right of points at infinity, px."""
         return float(self.left.projection[0, 2] - self.right.projection[0, 2])
+
+    @property
+    def depths(self) -> tuple[float, float]:
+        """The least depth that both rectified views show, and the greatest that they tell; calibration's
+        unit."""
+        widest = self.image_size[0] - 1 - self.disparity_at_infinity
+        return self.focal * self.baseline / widest, self.focal * self.baseline / _LEAST_DISPARITY_PX
 
     def reduced(self, scale: int) -> StereoRig:
         """The rig for rectified images of which only every `scale`-th pixel is kept, from the first."""

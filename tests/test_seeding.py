@@ -14,7 +14,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.tracking import Tracker
 from suturetrack.tracking.thread import not_found
 from suturetrack.tracking.tracker import FORGOTTEN
-from suturetrack.types import Seed, Stamp
+from suturetrack.types import InputError, Seed, Stamp
 
 
 @pytest.mark.parametrize("again", [False, True])
@@ -37,3 +37,20 @@ def test_a_seed_is_taken_up_when_it_came_after_its_thread_was_dropped(
     assert tracker.is_sought("a") == again
     after.close()
     source.close()
+
+
+@pytest.mark.parametrize(("depth", "said"), [(148_000.0, "148"), (0.148, "0.000148")])
+def test_a_point_in_another_unit_than_metres_is_refused(
+    rig: StereoRig, depth: float, said: str
+) -> None:
+    hub = Hub()
+    bus = Bus(hub.connect(), "rig", "tracker")
+    desk = SeedDesk(bus, Tracker(rig), rig)
+    desk.seed(Seed("a", point=(12.0, -3.0, 148.0)))
+    with pytest.raises(InputError) as caught:
+        desk.seed(Seed("b", point=(depth / 12, -depth / 50, depth)))
+    assert str(caught.value) == (
+        f"the seed is {said} m away, but the cameras see from 0.0501 to 16 m; a point is in metres"
+    )
+    assert [*desk.seeds] == ["a"]
+    bus.close()
