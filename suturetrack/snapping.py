@@ -98,8 +98,13 @@ def pixel_in_area(
         config: of the initialisation that the seed is for.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or a number is not within the image.
     """
+    width, height = rig.image_size
+    for number, side in zip(area, 2 * rig.image_size, strict=True):
+        if not 0 <= number <= side:
+            given = " ".join(f"{number:g}" for number in area)
+            raise InputError(f"area {given}: {number:g} is not within the {width}x{height} image")
     corners = rig.rectify_pixels(np.reshape(area, (2, 2)).astype(float), right=right)
     found = snap_area(field.right if right else field.left, corners, config)
     if found is None:

@@ -109,6 +109,14 @@ def test_a_thread_in_the_right_view_alone_is_refused(rig: StereoRig) -> None:
         point_of_right_pixel(field, rig, rig.project(line)[1][300], CONFIG)
 
 
+@pytest.mark.parametrize("wrong", ["nan", "-3", "641"])
+def test_the_wrong_number_of_an_area_is_named(rig: StereoRig, wrong: str) -> None:
+    area = (10.0, 20.0, float(wrong), 40.0)
+    said = f"area 10 20 {wrong} 40: {wrong} is not within the 640x480 image"
+    with pytest.raises(InputError, match=said):
+        pixel_in_area(paint(rig, [], 0), rig, area)
+
+
 def test_an_area_of_a_raw_image_gives_a_raw_pixel_on_the_thread(line: np.ndarray) -> None:
     """A rig whose raw images are distorted."""
     rig = open_scene("figure8-107", 0, picture=Picture(distortion=-0.2)).rig
