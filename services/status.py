@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -16,7 +16,7 @@ from services import topics
 from services.bus import Bus
 from services.client import Client, Seen
 from services.messages import Health
-from services.tables import new_table, number
+from services.tables import new_table, number, report_console
 from services.zenoh_transport import ZenohTransport, load_config, local_config, local_rigs
 from suturetrack.types import InputError, Status
 
@@ -119,7 +119,7 @@ def run(config: StatusConfig) -> None:
     """Shows the table until Ctrl-C; raises InputError."""
     if config.zenoh is not None and config.rig is None:
         raise InputError("--zenoh needs --rig, the name of the rig behind it")
-    console = Console()
+    console = report_console()
     watches: dict[str, RigWatch] = {}
     try:
         if config.once:

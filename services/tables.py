@@ -6,11 +6,11 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-_FILE_WIDTH = 110
+_FILE_WIDTH = 1000
 
 
 def report_console() -> Console:
-    """Standard output; wide enough for the tables where it is a file."""
+    """Standard output; where it is a file, so wide that nothing is cut."""
     console = Console()
     return console if console.is_terminal else Console(width=_FILE_WIDTH)
 

@@ -178,6 +178,17 @@ def test_status_shows_processes_and_threads(rig: Bus, capsys: pytest.CaptureFixt
     assert capsys.readouterr().out == ""
 
 
+def test_status_cuts_nothing_where_there_is_no_terminal(
+    rig: Bus, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trouble = 3 * "the left image is all but black; is the lens covered? "
+    say(rig, replace(HEALTHY, process=64 * "p", warning=trouble))
+    run(StatusConfig(rig.rig, once=True))
+    out = capsys.readouterr().out
+    assert 64 * "p" in out
+    assert trouble in out
+
+
 def test_a_process_that_others_can_reach_is_named() -> None:
     code = (
         "import socket, sys; open('/proc/self/comm', 'w').write('tracker');"
