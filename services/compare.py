@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 from rich.console import Console
+from rich.markup import escape
 
 from services.course import Course
 from services.output import opened
@@ -98,6 +99,9 @@ def show(summaries: list[RunSummary], distances: list[Distances], console: Conso
     for label, name in zip(labels, names, strict=True):
         legend.add_row(label, name)
     console.print(legend)
+    for label, summary in zip(labels, summaries, strict=True):
+        for problem in summary.problems:
+            console.print(f"[yellow]{label}: {escape(problem)}[/]", highlight=False)
     for thread in sorted({t.thread for summary in summaries for t in summary.threads}):
         rows = new_table(f"Thread {thread}", "", *labels)
         for label, value in _ROWS.items():
@@ -130,7 +134,7 @@ def exceeded(
     if config.tolerance_mm is None and config.tolerance_tracking is None:
         return excess
     if not summaries[0].threads:
-        return [f"{summaries[0].name}: no thread was seeded, there is nothing to compare with"]
+        return [f"{summaries[0].name}: {summaries[0].no_thread}, there is nothing to compare with"]
     if config.tolerance_mm is not None:
         for summary in summaries[1:]:
             excess += _not_compared(summaries[0], summary, distances)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import sys
 import threading
 import time
 import tomllib
@@ -77,6 +78,8 @@ def run(config: ReplayConfig) -> None:
             cannot be written, or a process failed, as for a seed on no thread.
     """
     folder = RunFolder(config.run)
+    for problem in folder.problems:
+        print(f"replay: {problem}", file=sys.stderr)
     parameters = changed(_recorded_parameters(config.run), config.set)
     new = config.run_dir or _beside(config.run)
     if new.is_dir() and any(new.glob("*.rrd")):

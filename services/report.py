@@ -18,7 +18,7 @@ def show(summary: RunSummary, console: Console) -> None:
         console.print(f"[yellow]{escape(problem)}[/]", highlight=False)
     console.print(_processes(summary.processes))
     if not summary.threads:
-        console.print("no thread was seeded")
+        console.print(summary.no_thread)
         return
     for table in (_status(summary.threads), _lengths(summary.threads), _energies(summary.threads)):
         console.print(table)

@@ -123,6 +123,11 @@ class RunSummary:
     courses: list[Course]
     problems: list[str]
 
+    @property
+    def no_thread(self) -> str:
+        """Why there may be none, in words."""
+        return "no thread in what can be read" if self.problems else "no thread was seeded"
+
 
 def summarize(folder: RunFolder) -> RunSummary:
     """Reads what the figures need, and no image."""

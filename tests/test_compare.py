@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from services.compare import CompareConfig, run
+from services.inspect import InspectConfig
+from services.inspect import run as inspect
 from services.recording import Recorder
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
@@ -78,3 +80,18 @@ def test_a_thread_that_a_run_lacks_fails_the_check(
         run(CompareConfig((runs[0], tmp_path / "empty"), tolerance_mm=1.0))
     with pytest.raises(SystemExit, match="empty: no thread was seeded"):
         run(CompareConfig((tmp_path / "empty", runs[0]), tolerance_tracking=5.0))
+
+
+def test_a_recording_that_is_cut_is_not_taken_for_a_run_without_a_thread(
+    runs: tuple[Path, Path, Path], rig: StereoRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, cut, _ = runs
+    with Recorder(cut, "segmenter", "light", rig):
+        pass
+    with (cut / "tracker.rrd").open("r+b") as file:
+        file.truncate(1000)
+    inspect(InspectConfig(cut))
+    assert "no thread in what can be read" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="moved: no thread in what can be read"):
+        run(CompareConfig((cut, whole), tolerance_mm=1.0))
+    assert "run 1: tracker.rrd is " in capsys.readouterr().out
