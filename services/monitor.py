@@ -12,6 +12,7 @@ from services import topics
 from services.bus import Bus
 from services.messages import Health
 from services.pulse import Pulse
+from services.tables import number
 from suturetrack.types import Status, ThreadState, Truth
 
 _STALE_S = 3.0
@@ -110,10 +111,10 @@ class Monitor:
         for name, thread in self._threads.items():
             shares = [100 * thread.statuses[s] / max(1, self._frames()) for s in Status]
             mean, sigma = _mean_and_sigma(thread.lengths_mm)
-            cells = [name, *(f"{s:.1f}" for s in shares), f"{mean:.2f}", f"{sigma:.2f}"]
+            cells = [name, *(f"{s:.1f}" for s in shares), number(mean, 2), number(sigma, 2)]
             if with_truth:
                 true, _ = _mean_and_sigma(thread.true_mm)
-                cells += [f"{true:.2f}", f"{100 * (mean - true) / true:+.2f}"]
+                cells += [number(true, 2), number(100 * (mean - true) / true, 2)]
             table.add_row(*cells)
         return table
 
@@ -124,11 +125,12 @@ class Monitor:
             table.add_column(column, justify="right")
         for name, health in self._in_order():
             latency = health.run_latency
+            figures = latency.p50_ms, latency.p99_ms, latency.max_ms
             table.add_row(
                 name,
                 str(self._total(name, "frames")),
-                f"{health.run_rate_hz:.2f}",
-                *(f"{ms:.1f}" for ms in (latency.p50_ms, latency.p99_ms, latency.max_ms)),
+                number(health.run_rate_hz if health.frames > 1 else np.nan, 2),
+                *(number(ms if health.frames else np.nan, 1) for ms in figures),
                 str(self._total(name, "dropped")),
                 str(self._total(name, "refused")),
                 f"{health.memory_mb:.0f}",

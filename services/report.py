@@ -38,7 +38,7 @@ def _processes(processes: list[ProcessSummary]) -> Table:
     for p in processes:
         ms = p.latency_ms
         table.add_row(
-            *(p.name, str(p.frames), f"{p.rate_hz:.1f}"),
+            *(p.name, str(p.frames), number(p.rate_hz, 1)),
             *(f"{x:.1f}" for x in (ms.p50, ms.p99, ms.largest)),
             *(str(p.dropped), f"{p.memory_mb:.0f}"),
         )
