@@ -52,6 +52,11 @@ def run(service: Service, config: SourceConfig) -> None:
     steps = bus.newest(topics.STEP)
     bus.answer(topics.CALIBRATION, lambda _: rig)
     recorder = service.record(rig, config)
+    wanted, there = config.input.frames, footage.frame_count
+    if wanted is not None and there is not None and there < wanted:
+        service.complain(
+            f"{config.input.source} ends after {there} frames, before --frames {wanted}"
+        )
     first = footage.read(0)
     if first is not None:
         bus.make_room(StereoFrame(Stamp(0, 0, 0), first.left, first.right))

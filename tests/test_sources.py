@@ -9,7 +9,7 @@ import pytest
 from services.bus import Bus
 from services.memory_transport import Hub
 from services.service import Service, ServiceConfig
-from services.source import _Pace
+from services.source import SourceConfig, _Pace, run
 from services.sources import InputConfig, open_input
 from services.sources.footage import Footage
 from suturetrack.calibration import save_calibration
@@ -195,6 +195,17 @@ def test_a_loop_goes_there_and_back_in_rising_time(tmp_path: Path, calibration: 
     assert [e.capture_ns for e in exposures if e][-1] == round(4001 * 1e9 / 30)
     with pytest.raises(InputError, match="--loop 7"):
         open_input(InputConfig(**options, loop=7))  # type: ignore[arg-type]
+
+
+def test_a_source_that_ends_before_all_the_frames_that_are_wanted_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    config = SourceConfig(InputConfig("stage:figure8-107", fps=0.2, frames=9))
+    service = Service("source", config.service, Bus(Hub().connect(), "rig", "source"))
+    service.bus.stop.set()
+    with service:
+        run(service, config)
+    assert "stage:figure8-107 ends after 4 frames, before --frames 9" in caplog.messages
 
 
 @pytest.mark.parametrize("frames", [None, COUNT - 1, 2 * COUNT])
