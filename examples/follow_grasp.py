@@ -10,6 +10,7 @@ is none, the gripper holds still: that is the point of the exercise.
 import sys
 
 from services.client import Refused, connect
+from suturetrack.types import InputError
 
 FROM_END_M = 0.010
 APPROACH = (0.0, 0.0, 1.0)  # away from the camera
@@ -37,4 +38,11 @@ def main(rig: str = "rig") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) > 2:
+        sys.exit("usage: follow_grasp.py [RIG]")
+    try:
+        main(*sys.argv[1:])
+    except InputError as error:
+        sys.exit(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)

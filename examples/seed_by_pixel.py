@@ -32,4 +32,11 @@ def main(u: str, v: str, view: str = "left", rig: str = "rig") -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    if not 3 <= len(sys.argv) <= 5:
+        sys.exit("usage: seed_by_pixel.py U V [left|right] [RIG]")
+    try:
+        sys.exit(main(*sys.argv[1:]))
+    except ValueError as error:  # InputError too: no system runs, or a bad name.
+        sys.exit(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)

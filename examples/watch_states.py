@@ -7,7 +7,7 @@ python examples/watch_states.py       # in another
 import sys
 
 from services.client import connect
-from suturetrack.types import Status
+from suturetrack.types import InputError, Status
 
 
 def main(rig: str = "rig") -> None:
@@ -29,4 +29,11 @@ def main(rig: str = "rig") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) > 2:
+        sys.exit("usage: watch_states.py [RIG]")
+    try:
+        main(*sys.argv[1:])
+    except InputError as error:
+        sys.exit(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -86,13 +86,38 @@ def test_the_examples_and_the_verbs_work_on_a_running_system(
     next(lines(verb, r"frame \d+  position .* mm  quaternion xyzw .* sigma .* age \d+ ms"))
     for process in (watch, follow, verb):
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
+        assert not process.communicate(timeout=60)[1]
 
-    again = start("-m", "services.cli", "seed", u, v, "--thread", "needle")
+    for process in (watch, follow):
+        assert process.returncode == 130
+
+    again = start("-m", "services.cli", "seed", u, v)
     out, err = again.communicate(timeout=60)
     assert again.returncode == 0, err
-    assert out.startswith("thread needle: found ")
+    assert out.startswith("thread 0: found ")
+    other = start("-m", "services.cli", "seed", u, v, "--thread", "needle")
+    _, err = other.communicate(timeout=60)
+    assert (other.returncode, err) == (1, "suturetrack seed: that is thread 0 already\n")
     unknown = start("-m", "services.cli", "grasp", "--fraction", 0.5, "--thread", "x")
     _, err = unknown.communicate(timeout=60)
     assert unknown.returncode == 1
     assert "no thread 'x'; there is 0, needle" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("seed_by_pixel.py",), "usage: seed_by_pixel.py U V [left|right] [RIG]"),
+        (("seed_by_pixel.py", "a", 3), "could not convert string to float: 'a'"),
+        (("watch_states.py", "rig", 3), "usage: watch_states.py [RIG]"),
+        (("follow_grasp.py", "a/b"), "rig 'a/b': use 1 to 64 of A-Z a-z 0-9 _ -"),
+    ],
+)
+def test_an_example_that_is_called_wrongly_says_so_in_one_line(
+    words: tuple[object, ...], said: str
+) -> None:
+    name, *others = map(str, words)
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / name, *others], capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (1, f"{said}\n")
