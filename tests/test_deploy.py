@@ -9,12 +9,18 @@ from pathlib import Path
 import pytest
 import tyro
 
+from services.access import ROLES
 from services.cli import VERBS
 from services.service import HEARTBEAT_S
 from services.zenoh_transport import load_config
 
 DEPLOY = Path(__file__).parents[1] / "services" / "deploy"
-OPTIONS = {"source": ["--source", "0,1", "--calibration", "rig.yaml"]}
+OPTIONS = {
+    "source": ["--source", "0,1", "--calibration", "rig.yaml"],
+    "tooltip": ["--hand-eye", "hand_eye.yaml"],
+}
+ALONE = ("run", "client")
+"""Who connects to a rig without being a verb that a unit starts."""
 
 
 def started_by(unit: str) -> list[str]:
@@ -25,7 +31,10 @@ def started_by(unit: str) -> list[str]:
     return shlex.split(line)[1:]
 
 
-@pytest.mark.parametrize("process", ["source", "segmenter", "tracker"])
+@pytest.mark.parametrize(
+    "process",
+    ["record", *(p for role in ROLES.values() for p in role.processes if p not in ALONE)],
+)
 def test_the_unit_of_a_process_starts_it_to_go_on_where_the_last_one_left_off(process: str) -> None:
     words = [word.replace("%i", process) for word in started_by("suturetrack@.service")]
     assert words[0] == process
@@ -33,8 +42,9 @@ def test_the_unit_of_a_process_starts_it_to_go_on_where_the_last_one_left_off(pr
     verb = VERBS[process]
     kind = getattr(importlib.import_module(verb.module), verb.config)
     config = tyro.cli(kind, args=[*words[1:-1], *OPTIONS.get(process, [])])
-    assert config.service.zenoh == Path(f"/etc/suturetrack/{process}.json5")
-    assert config.service.resume == 1
+    service = getattr(config, "service", config)
+    assert service.zenoh == Path(f"/etc/suturetrack/{process}.json5")
+    assert service.resume == 1
 
 
 def test_the_unit_of_a_process_waits_for_heartbeats() -> None:

@@ -31,6 +31,8 @@ class ConsoleConfig:
     over the network in the clear: put a tunnel or a TLS proxy before it."""
     port: int = 8470
     """Port to serve on; 0 takes a free one."""
+    resume: int = 0
+    """How many consoles died before this one; only told in its health."""
 
 
 def run(config: ConsoleConfig) -> None:
@@ -52,7 +54,8 @@ def run(config: ConsoleConfig) -> None:
         finally:
             recording.close()
 
-    run_service("console", ServiceConfig(rig=config.rig, zenoh=config.zenoh), body)
+    service = ServiceConfig(rig=config.rig, zenoh=config.zenoh, resume=config.resume)
+    run_service("console", service, body)
 
 
 def _is_loopback(host: str) -> bool:
