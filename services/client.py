@@ -51,8 +51,8 @@ _ARRIVAL_S = 3.0
 """How long whoever answers may take to appear."""
 _ANSWER_S = 2.0
 _GONE_NS = 3_000_000_000
-"""A thread of which nothing has come for so long, while something came of others, is followed no more: the
-tracker that held it has ended, and another one runs."""
+"""A thread of which nothing has come for so long, nor since the last but one state of another, is followed no
+more: the tracker that held it has ended, and another one runs."""
 
 log = logging.getLogger("suturetrack")
 
@@ -336,13 +336,15 @@ class Client:
         for state in self._reader:
             seen = Seen(state, self._reader.arrived_ns)
             with self._lock:
+                before = self._latest.get(state.thread, seen)
+                since_ns = min(before.arrived_ns, seen.arrived_ns - _GONE_NS)
                 self._latest[state.thread] = seen
                 if FORGOTTEN in state.events:
                     del self._latest[state.thread]
                 self._latest = {
                     name: other
                     for name, other in self._latest.items()
-                    if seen.arrived_ns - other.arrived_ns < _GONE_NS
+                    if other.arrived_ns >= since_ns
                 }
                 for inbox, thread in self._listeners.items():
                     if thread in (None, state.thread):

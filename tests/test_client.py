@@ -314,6 +314,22 @@ def test_a_thread_that_nobody_follows_any_more_is_gone(
     assert stage.client.latest("a") is None
 
 
+def test_threads_of_a_slow_stream_are_not_gone_between_two_frames(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("services.client._GONE_NS", 50_000_000)
+    for name in "ab":
+        stage.publish(1, name)
+    wait_until(lambda: set(stage.client.threads) == {"a", "b"})
+    wait_until(lambda: (seen := stage.client.latest("b")) is not None and not seen.live)
+    got = follow(stage, "a")
+    stage.publish(2, "a")
+    wait_until(lambda: got)
+    assert set(stage.client.threads) == {"a", "b"}
+    stage.publish(3, "a")
+    wait_until(lambda: stage.client.threads == ("a",))
+
+
 def test_nobody_there_is_said_plainly(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.client._ARRIVAL_S", 0.05)
     with pytest.raises(Unavailable, match="no tracker runs on rig 'rig'"):
