@@ -27,6 +27,8 @@ _BUFFERED = 4
 """How many frames may be late before some are skipped, as in the buffer of a camera's driver."""
 _KEEPER_S = 2.0
 """After a death: how long to wait for the process that knows where to go on."""
+_ROUNDED_S = 0.5
+"""By how much a video may end before the time that its container tells, which is also that of its sound."""
 _LAST_STEP_S = 2.0
 """In real time: how long the last frame may take to go through."""
 
@@ -145,6 +147,8 @@ class _Pace:
         exposure = self._read(index)
         due_in = self._began + index / self._footage.fps - time.monotonic()
         stopped = not self._patient and due_in > 0 and self._service.bus.stop.wait(due_in)
+        if exposure is None:
+            self._tell_early_end(index)
         if exposure is None or stopped:
             raise StopIteration
         self.last, self._index = index, index + 1
@@ -162,6 +166,15 @@ class _Pace:
                 self._service.awaits = ""
                 return exposure
         return None
+
+    def _tell_early_end(self, index: int) -> None:
+        """Says where the input ended long before it should, as a file does that was cut off."""
+        promised, fps = self._footage.frame_count or 0, self._footage.fps
+        if index < promised - _ROUNDED_S * fps:
+            self._service.complain(
+                f"the input ended before frame {index} of the {promised} that it promises; "
+                "the file is cut short"
+            )
 
     def _skip(self) -> None:
         due = int(min((time.monotonic() - self._began) * self._footage.fps, self._end))

@@ -137,6 +137,12 @@ def test_a_folder_that_is_none_of_pairs_is_refused(tmp_path: Path, calibration: 
     refused(folder, calibration, "1 images in left/, 2 in right/")
 
 
+def cut(suffix: str) -> bytes:
+    """An image file without its last tenth."""
+    whole = cv2.imencode(suffix, picture(2, 1))[1].tobytes()
+    return whole[: len(whole) * 9 // 10]
+
+
 @pytest.mark.parametrize(
     ("wrong", "reason"),
     [
@@ -145,8 +151,10 @@ def test_a_folder_that_is_none_of_pairs_is_refused(tmp_path: Path, calibration: 
         (np.zeros((HEIGHT, WIDTH // 2, 3), np.uint8), r"is \(240, 160, 3\)"),
         (b"no image", "cannot be read"),
         (b"", "cannot be read"),
+        (cut(".png"), "cut short"),
+        (cut(".jpg"), "cut short"),
     ],
-    ids=["16 bit", "gray", "narrow", "text", "empty"],
+    ids=["16 bit", "gray", "narrow", "text", "empty", "cut png", "cut jpg"],
 )
 def test_a_wrong_image_in_the_middle_is_named(
     tmp_path: Path, calibration: Path, wrong: Image | bytes, reason: str
@@ -175,14 +183,20 @@ def test_videos_that_do_not_match_are_refused(tmp_path: Path, calibration: Path)
     refused(f"{tmp_path / 'a.avi'},{tmp_path / 'c.avi'}", calibration, "the other")
 
 
-def test_a_video_that_is_cut_off_ends_early(tmp_path: Path, calibration: Path) -> None:
-    write_video(tmp_path / "both.avi", [both(i) for i in range(COUNT)])
+@pytest.mark.parametrize("kept", [0.5, 1.0])
+def test_a_video_that_is_cut_off_ends_early_and_says_so(
+    tmp_path: Path, calibration: Path, kept: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    promised = 40
+    write_video(tmp_path / "both.avi", [both(i % COUNT) for i in range(promised)])
     whole = (tmp_path / "both.avi").read_bytes()
-    (tmp_path / "both.avi").write_bytes(whole[: len(whole) // 2])
-    footage = open_footage(tmp_path / "both.avi", calibration)
-    seen = [footage.read(i) is not None for i in range(COUNT)]
-    assert seen[0]
-    assert not seen[-1]
+    (tmp_path / "both.avi").write_bytes(whole[: round(kept * len(whole))])
+    config = ServiceConfig(lockstep=True)
+    service = Service("source", config, Bus(Hub().connect(), "rig", "source"))
+    given = list(_Pace(service, open_footage(tmp_path / "both.avi", calibration), None, None))
+    assert len(given) == promised if kept == 1 else 10 < len(given) < 30
+    told = f"ended before frame {len(given)} of the {promised} that it promises"
+    assert (told in caplog.text) == (kept < 1)
 
 
 def test_a_loop_goes_there_and_back_in_rising_time(tmp_path: Path, calibration: Path) -> None:

@@ -11,6 +11,9 @@ import numpy as np
 
 from suturetrack.types import Image, InputError, Truth
 
+_STARTS_AND_ENDS = ((b"\x89PNG", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))
+"""Of PNG and JPEG files."""
+
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
@@ -62,8 +65,15 @@ def read_image(path: Path) -> Image:
     """An 8-bit image as (H, W, 3) BGR or (H, W) gray; raises InputError."""
     if not path.is_file():
         raise InputError(f"no image {path}")
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None or image.size == 0:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"image {path} cannot be read: {error.strerror}") from error
+    if any(data.startswith(start) and end not in data for start, end in _STARTS_AND_ENDS):
+        raise InputError(f"image {path} is cut short: the end of the file is missing")
+    # From memory, as what is missing of a JPEG file is filled with gray.
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if image is None:
         raise InputError(f"image {path} cannot be read; use PNG, JPEG, TIFF or BMP")
     if image.dtype != np.uint8:
         raise InputError(f"image {path} is {image.dtype}; convert it to 8 bit")
