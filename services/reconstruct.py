@@ -43,8 +43,8 @@ class ReconstructConfig:
     _: KW_ONLY
     calibration: Path
     """Calibration of the rig."""
-    output: Path
-    """The file to write."""
+    output: Path | None = None
+    """The file to write; standard output when not given."""
     seed: tuple[float, float] | None = None
     """U V: a pixel on the thread in the raw left image."""
     area: tuple[float, float, float, float] | None = None
@@ -64,11 +64,11 @@ class ReconstructConfig:
 
 
 def run(config: ReconstructConfig) -> None:
-    """Reconstructs the thread and writes the file.
+    """Reconstructs the thread, writes the object, and tells of a file in one line.
 
     Raises:
-        InputError: the images, the calibration or the seed are at fault, or no thread is found; no
-            file is written.
+        InputError: the images, the calibration or the seed are at fault, or no thread is found;
+            nothing is written.
     """
     if sum((config.seed is not None, config.area is not None, config.laser)) != 1:
         raise InputError("give exactly one of --seed U V, --area U V U V and --laser")
@@ -85,6 +85,10 @@ def run(config: ReconstructConfig) -> None:
         raise InputError(error.reason) from error
     with opened(config.output) as file:
         file.write(json.dumps(record(found), indent=1, allow_nan=False) + "\n")
+    if config.output is not None and config.output.is_file():
+        length_mm = 1000 * rig.metres_per_unit * nurbs.length(found.curve)
+        words = f"{length_mm:.1f} mm long, confidence {found.confidence:.2f}"
+        print(f"Curve in {config.output}: {'; '.join([words, *found.reasons])}")
 
 
 def _pixel(

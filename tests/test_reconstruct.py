@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,16 +51,34 @@ def curve_in(path: Path) -> Nurbs:
 
 
 def test_a_pair_becomes_one_object(
-    pair: tuple[Image, Image, ReconstructConfig], curve: Nurbs
+    pair: tuple[Image, Image, ReconstructConfig], curve: Nurbs, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = pair[2]
     run(config)
+    said = capsys.readouterr().out
     written = json.loads(config.output.read_text())
     found = curve_in(config.output)
     assert curve_error(dense(found), dense(curve)).mean < 0.3
     assert written["length"] == pytest.approx(nurbs.length(found))
     assert 0 < written["reprojection_px"] < 0.2
     assert 0.5 < written["confidence"] <= 1
+    millimetres, confidence = f"{written['length']:.1f} mm", f"{written['confidence']:.2f}"
+    words = f"Curve in {config.output}: {millimetres} long, confidence {confidence}"
+    assert said == "; ".join([words, *written["reasons"]]) + "\n"
+
+
+def test_what_goes_elsewhere_than_to_a_file_is_the_object_alone(
+    pair: tuple[Image, Image, ReconstructConfig], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(replace(pair[2], output=None))
+    object_ = capsys.readouterr().out
+    assert json.loads(object_)["degree"] == 3
+    reading, writing = os.pipe()
+    run(replace(pair[2], output=Path(f"/dev/fd/{writing}")))
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        assert pipe.read() == object_
+    assert capsys.readouterr().out == ""
 
 
 def test_side_by_side_is_the_same(pair: tuple[Image, Image, ReconstructConfig]) -> None:
