@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import sys
 import threading
 import time
@@ -23,7 +24,7 @@ from services import topics
 from services.bus import Bus
 from services.console.feed import Feed
 from services.console.recording import Recording
-from services.console.server import Console
+from services.console.server import Console, serve
 from services.memory_transport import Hub
 from services.messages import Forgotten, SeedReply
 from services.wire import scaled
@@ -334,6 +335,14 @@ def test_no_other_site_gets_in(stage: Stage) -> None:
                 pass
 
     asyncio.run(flow())
+
+
+def test_a_port_that_is_taken_is_said_in_one_line(stage: Stage) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        words = f"^cannot serve on 127.0.0.1:{port}: Address already in use; give another --port"
+        with pytest.raises(InputError, match=words):
+            serve(stage.feed, "127.0.0.1", port, "")
 
 
 def test_no_stranger_gets_in(stage: Stage) -> None:

@@ -39,6 +39,7 @@ def test_a_length_without_a_unit_is_refused(text: str) -> None:
         ("grasp", "exactly one of"),
         ("grasp --from-end 10mm --fraction 0.5", "exactly one of"),
         ("grasp --from-end 10", "such as 10mm"),
+        ("console --port 9999999", "port 9999999: use 1 to 65535, or 0"),
     ],
 )
 def test_bad_calls_get_one_clear_line(

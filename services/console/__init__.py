@@ -41,6 +41,8 @@ def run(config: ConsoleConfig) -> None:
     Raises:
         InputError: the address or the configuration cannot be used.
     """
+    if not 0 <= config.port <= 65535:
+        raise InputError(f"port {config.port}: use 1 to 65535, or 0 for a free one")
     token = "" if _is_loopback(config.host) else secrets.token_urlsafe(16)
 
     def body(service: Service) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import os
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 from typing import Annotated, Any
@@ -236,7 +237,8 @@ async def _serve(feed: Feed, host: str, port: int, token: str) -> None:
     except OSError as error:
         await runner.cleanup()
         raise InputError(
-            f"cannot serve on {host}:{port}: {error.strerror}; give another --port"
+            f"cannot serve on {host}:{port}: {os.strerror(error.errno or 0)}; "
+            "give another --port or --host"
         ) from error
     port = runner.addresses[0][1]
     where = f"[{host}]" if ":" in host else host
