@@ -113,13 +113,13 @@ def call(arguments: Sequence[str]) -> int:
 
 
 def _run(name: str, verb: _Verb, arguments: list[str]) -> int:
-    import tyro  # late, so that the overview and wrong verbs are quick
-
+    # Late, so that the overview and wrong verbs are quick.
+    from services.arguments import parse
     from suturetrack.types import InputError
 
     module = importlib.import_module(verb.module)
     kind = getattr(module, verb.config)
-    config = tyro.cli(kind, prog=f"suturetrack {name}", args=arguments)
+    config = parse(kind, f"suturetrack {name}", arguments)
     try:
         if verb.process:
             from services import service

@@ -93,6 +93,33 @@ def test_run_without_a_source_is_a_wrong_call(call: Call) -> None:
     assert "--source" in err
 
 
+@pytest.mark.parametrize("columns", ["40", "200"])
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ("run --sorce x", "missing --source STR; unrecognized options: --sorce x; see"),
+        ("run --source x --fps abc", "could not convert string to float: 'abc'; use --fps FLOAT;"),
+        ("run --source", "missing value for argument '--source'"),
+        ("seed 3", "no type matching {FLOAT FLOAT} could be instantiated from ['3'];"),
+        ("inspect", "missing PATH (The run's folder); see"),
+        ("bench trackin", "available subcommands: tracking, initialization"),
+        ("bench tracking --seds 3", "perhaps you meant: --seeds INT"),
+        ("replay r --from source", "Expected one of ('segmenter', 'tracker'); see"),
+    ],
+)
+def test_a_wrong_call_gets_one_line_with_what_would_be_right(
+    call: Call, monkeypatch: pytest.MonkeyPatch, columns: str, words: str, reason: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    status, err = call(*words.split())
+    verb = words.split()[0]
+    assert status == 2
+    assert err.count("\n") == 1
+    assert err.startswith(f"suturetrack {verb}: ")
+    assert reason in err
+    assert err.endswith(f"; see `suturetrack {verb} --help`\n")
+
+
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
