@@ -18,6 +18,7 @@ from services.bus import Bus, NoAnswer
 from services.freshness import Freshness
 from services.messages import ToolPose, ToolSnap
 from services.service import Service, ServiceConfig
+from suturetrack.calibration.pair import numbers
 from suturetrack.camera import StereoRig
 from suturetrack.snapping import snap_point
 from suturetrack.types import Float64, InputError, RidgeField, Seed
@@ -75,30 +76,27 @@ def run(service: Service, config: TooltipConfig) -> None:
 
 def load_hand_eye(path: Path) -> HandEye:
     """Reads the hand-eye file; raises InputError."""
+    where = f"hand-eye {path}"
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except OSError as error:
+        raise InputError(f"{where}: {error.strerror}") from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        mark = getattr(error, "problem_mark", None)
         raise InputError(
-            f"hand-eye {path}: cannot be read as YAML: {error}".split("\n")[0]
+            f"{where}: no YAML{f' in line {mark.line + 1}' if mark else ''}"
         ) from error
     if not isinstance(content, dict) or "camera_from_base" not in content:
-        raise InputError(f"hand-eye {path}: camera_from_base is missing")
-    try:
-        matrix = np.array(content["camera_from_base"], float)
-        tip = np.array(content.get("tip", (0, 0, 0)), float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"hand-eye {path}: {error}") from error
+        raise InputError(f"{where}: camera_from_base is missing, four rows of four numbers")
+    matrix = numbers(content["camera_from_base"], (4, 4), "camera_from_base", where)
+    tip = numbers(content.get("tip", (0, 0, 0)), (3,), "tip", where)
+    if not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise InputError(f"{where}: the last row of camera_from_base must be 0 0 0 1")
     rotation = matrix[:3, :3]
-    if matrix.shape != (4, 4) or not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise InputError(
-            f"hand-eye {path}: camera_from_base must have four rows of four, last 0 0 0 1"
-        )
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
-        raise InputError(f"hand-eye {path}: camera_from_base holds no rotation")
-    if tip.shape != (3,) or not np.isfinite([*tip, *matrix[:3, 3]]).all():
-        raise InputError(f"hand-eye {path}: tip must be x y z; all numbers must be finite")
+        raise InputError(f"{where}: camera_from_base holds no rotation")
     if np.abs([*tip, *matrix[:3, 3]]).max() > 10:
-        raise InputError(f"hand-eye {path}: a length above 10 m; are these millimetres?")
+        raise InputError(f"{where}: a length above 10 m; are these millimetres?")
     return HandEye(matrix, tip)
 
 

@@ -153,12 +153,15 @@ def test_the_tip_is_turned_into_the_rectified_view(distorted_rig: StereoRig) -> 
     ("content", "reason"),
     [
         ({}, "camera_from_base is missing"),
-        ({"camera_from_base": [[1, 0], [0, 1]]}, "four rows of four"),
-        ({"camera_from_base": "x"}, "could not convert"),
-        ({"camera_from_base": (2 * np.eye(4)).tolist()}, "four rows of four"),
+        ({"camera_from_base": [[1, 0], [0, 1]]}, "camera_from_base must be 4x4 numbers"),
+        ({"camera_from_base": BASE[:3].tolist()}, "camera_from_base must be 4x4 numbers"),
+        ({"camera_from_base": "x"}, "camera_from_base must be 4x4 numbers"),
+        ({"camera_from_base": None}, "camera_from_base must be 4x4 numbers"),
+        ({"camera_from_base": 5}, "camera_from_base must be 4x4 numbers"),
+        ({"camera_from_base": BASE.T.tolist()}, "last row of camera_from_base must be 0 0 0 1"),
         ({"camera_from_base": np.diag([2.0, 1, 1, 1]).tolist()}, "no rotation"),
         ({"camera_from_base": np.diag([-1.0, 1, 1, 1]).tolist()}, "no rotation"),
-        ({"camera_from_base": np.eye(4).tolist(), "tip": [1, 2]}, "tip must be x y z"),
+        ({"camera_from_base": np.eye(4).tolist(), "tip": [1, 2]}, "tip must be 3 numbers"),
         ({"camera_from_base": np.eye(4).tolist(), "tip": [0, 0, math.nan]}, "finite"),
         ({"camera_from_base": np.eye(4).tolist(), "tip": [0, 0, 120]}, "millimetres"),
     ],
@@ -172,7 +175,8 @@ def test_a_bad_hand_eye_file_gets_one_clear_line(
 
 
 def test_a_hand_eye_file_that_is_none_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "bad.yaml").write_text("{:")
-    for name in ("missing.yaml", "bad.yaml"):
-        with pytest.raises(InputError, match=name):
-            load_hand_eye(tmp_path / name)
+    (tmp_path / "bad.yaml").write_text("tip: [0, 0, 0]\ncamera_from_base: {:")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe")
+    for reason in ("missing.yaml: No such file", "bad.yaml: no YAML in line 2", "binary.yaml: no"):
+        with pytest.raises(InputError, match=reason):
+            load_hand_eye(tmp_path / reason.partition(":")[0])
