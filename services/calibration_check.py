@@ -143,6 +143,11 @@ def doubts(rig: StereoRig) -> list[str]:
             found.append(
                 f"{told} lies outside the {size[0]}x{size[1]} image; is it for another size?"
             )
+        elif _is_turned(centre, size):
+            found.append(
+                f"{told} is in the middle of {size[1]}x{size[0]}, not of the {size[0]}x{size[1]} image; "
+                "is its height given before its width?"
+            )
         elif np.any(np.abs(centre - size / 2) > 0.2 * size):
             found.append(f"{told} is far from the centre of the {size[0]}x{size[1]} image")
         fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
@@ -154,6 +159,12 @@ def doubts(rig: StereoRig) -> list[str]:
                 "pictures that reach the corners, or with fewer coefficients"
             )
     return found
+
+
+def _is_turned(centre: Float64, size: Float64) -> bool:
+    """Whether a principal point is in the middle of the image when its sides are exchanged, and only then."""
+    away, away_turned = (np.linalg.norm(centre - s / 2) for s in (size, size[::-1]))
+    return bool(away > 0.1 * size.max() and away_turned < away / 4)
 
 
 def _folding_px(rig: StereoRig, *, right: bool) -> float:

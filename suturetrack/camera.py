@@ -84,10 +84,13 @@ class StereoRig:
             )
             rotations, projections = (r1, r2), (p1, p2)
         if abs(projections[1][1, 3]) > abs(projections[1][0, 3]):
-            raise InputError("calibration: T runs along y; the cameras must stand side by side")
+            raise InputError(
+                f"T {np.ravel(translation).tolist()} must run along x, as cameras stand side by side "
+                "(x right, y down, z forward)"
+            )
         if projections[1][0, 3] >= 0:
             raise InputError(
-                "calibration: the right camera stands left of the left one (T[0] > 0); "
+                "the right camera stands left of the left one (T[0] > 0); "
                 "swap left and right, or give T as right_from_left"
             )
         cameras = [

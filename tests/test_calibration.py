@@ -97,7 +97,8 @@ def test_a_saved_rig_is_read_back(tmp_path: Path, rig: StereoRig) -> None:
         ({"K1": None}, "no matrix K1"),
         ({"ImageSize": None}, "no matrix ImageSize"),
         ({"T": np.zeros((3, 1))}, "T must have three entries, not all zero"),
-        ({"T": np.array([[40.0], [0], [0]])}, "swap left and right"),
+        ({"T": np.array([[40.0], [0], [0]])}, "rig.yaml: the right camera .* swap left and right"),
+        ({"T": np.array([[0.0], [0], [-40]])}, r"T \[0.0, 0.0, -40.0\] must run along x"),
         ({"R": np.diag([1.0, 1, -1])}, "R is not a rotation"),
         ({"R": 2 * np.eye(3)}, "R is not a rotation"),
         ({"K2": np.diag([-800.0, 800, 1])}, "K2 has a focal length that is not positive"),
@@ -358,6 +359,8 @@ def broken_pair(change: str) -> tuple[dict[str, Any], ...]:
             left["rectification_matrix"]["data"] = [0.0] * 9
         case "short":
             left["projection_matrix"]["data"] = p[:9]
+        case "transposed":
+            left["projection_matrix"] |= {"rows": 4, "cols": 3}
         case "word":
             left["projection_matrix"]["data"] = ["wide"] * 12
         case "none":
@@ -379,6 +382,7 @@ def broken_pair(change: str) -> tuple[dict[str, Any], ...]:
         ("no rotation", "left rectification_matrix is not a rotation"),
         ("short", "projection_matrix must be 3x4 numbers"),
         ("word", "projection_matrix must be 3x4 numbers"),
+        ("transposed", "left.yaml: projection_matrix is 4x3, it must be 3x4"),
         ("none", "no projection_matrix with data"),
     ],
 )
@@ -400,6 +404,7 @@ def test_a_ros_pair_that_cannot_be_is_refused(tmp_path: Path, change: str, words
         ({"cam0": {"resolution": [720, 480]}}, "differ in resolution"),
         ({"cam1": {"T_cn_cnm1": None}}, "cam1 T_cn_cnm1 must be 4x4 numbers"),
         ({"cam1": {"T_cn_cnm1": np.diag([1.0, 1, -1, 1]).tolist()}}, "R is not a rotation"),
+        ({"cam1": {"T_cn_cnm1": np.eye(4)[::-1].tolist()}}, "last row of cam1 T_cn_cnm1 must be"),
         ({"cam1": {"T_cn_cnm1": np.eye(4).tolist()}}, "T must have three entries, not all zero"),
     ],
 )

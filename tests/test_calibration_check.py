@@ -162,6 +162,9 @@ def test_doubts_are_told(rig: StereoRig, distorted_rig: StereoRig) -> None:
     assert "lies outside" in doubts(replace(rig, left=replace(rig.left, matrix=matrix)))[0]
     matrix[0, 2] = 500
     assert "far from the centre" in doubts(replace(rig, left=replace(rig.left, matrix=matrix)))[0]
+    turned = doubts(replace(rig, image_size=rig.image_size[::-1]))
+    assert len(turned) == 2
+    assert all("middle of 640x480, not of the 480x640 image" in line for line in turned)
     matrix = np.diag([1.2, 1, 1]) @ rig.left.matrix
     told = doubts(replace(rig, left=replace(rig.left, matrix=matrix)))
     assert any("not square" in line for line in told)

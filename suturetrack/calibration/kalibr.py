@@ -24,6 +24,10 @@ def rig_of_camchain(document: dict[str, Any], unit: str | None, where: str) -> S
         raise InputError(f"{where}: cam0 and cam1 differ in resolution")
     left, right = _lens(first, "cam0", where), _lens(second, "cam1", where)
     pose = numbers(second.get("T_cn_cnm1"), (4, 4), "cam1 T_cn_cnm1", where)
+    if not np.allclose(pose[3], [0, 0, 0, 1]):
+        raise InputError(
+            f"{where}: the last row of cam1 T_cn_cnm1 must be 0 0 0 1; is it transposed?"
+        )
     return rig_of_pair(sizes[0], left, right, (pose[:3, :3], pose[:3, 3]), unit, where)
 
 

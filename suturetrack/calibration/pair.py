@@ -54,7 +54,7 @@ def rig_of_pair(
         check_lens(lens, image_size, where)
     rotation, translation = pose
     if not is_rotation(rotation):
-        raise InputError(f"{where}: R is not a rotation matrix")
+        raise InputError(f"{where}: R is not a rotation matrix (orthonormal, determinant 1)")
     if translation.size != 3 or np.linalg.norm(translation) == 0:
         raise InputError(f"{where}: T must have three entries, not all zero (it is the baseline)")
     if left.fisheye != right.fisheye:

@@ -41,6 +41,11 @@ def camera_info(document: dict[str, Any], where: str) -> CameraInfo:
         entry = document.get(name)
         if not isinstance(entry, dict) or "data" not in entry:
             raise InputError(f"{where}: no {name} with data")
+        rows, columns = (entry.get(key) for key in ("rows", "cols"))
+        if len(shape) == 2 and None not in (rows, columns) and (rows, columns) != shape:
+            raise InputError(
+                f"{where}: {name} is {rows}x{columns}, it must be {shape[0]}x{shape[1]}"
+            )
         return numbers(entry["data"], shape, name, where)
 
     size = [document.get("image_width"), document.get("image_height")]
