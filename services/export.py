@@ -18,6 +18,8 @@ from services.run_folder import RecordedState, RunFolder
 from suturetrack.types import InputError
 
 Format = Literal["jsonl", "csv"]
+_FORMATS: dict[str, Format] = {"": "jsonl", ".jsonl": "jsonl", ".csv": "csv"}
+"""By the ending of the output."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class ExportConfig:
     output: Path | None = None
     """The file to write, .jsonl or .csv; standard output when not given."""
     format: Format | None = None
-    """What to write; by the ending of the output when not given, else JSON lines."""
+    """What to write; by the ending of the output when not given, JSON lines without an ending."""
 
 
 def run(config: ExportConfig) -> None:
@@ -45,13 +47,13 @@ def run(config: ExportConfig) -> None:
     Raises:
         InputError: the folder holds no readable recording of states, or the output cannot be made.
     """
+    write = _write_csv if _format(config) == "csv" else _write_json
     folder = RunFolder(config.run_dir)
     states = folder.states()
     for problem in folder.problems:
         print(f"export: {problem}", file=sys.stderr)
     if not states:
         raise InputError(f"{config.run_dir}: no states were recorded; was a thread seeded?")
-    write = _write_csv if _format(config) == "csv" else _write_json
     with opened(config.output) as file:
         write((record(state) for state in states), file)
 
@@ -84,7 +86,10 @@ def _number(value: float) -> float | None:
 def _format(config: ExportConfig) -> Format:
     if config.format is not None:
         return config.format
-    return "csv" if config.output and config.output.suffix.lower() == ".csv" else "jsonl"
+    suffix = "" if config.output is None else config.output.suffix.lower()
+    if suffix not in _FORMATS:
+        raise InputError(f"{config.output}: the name must end in .jsonl or .csv, or give --format")
+    return _FORMATS[suffix]
 
 
 def _write_json(records: Iterable[dict[str, Any]], file: TextIO) -> None:

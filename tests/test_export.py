@@ -87,6 +87,20 @@ def test_threads_and_parts_are_merged_in_order(
     ]
 
 
+def test_a_name_with_an_unknown_ending_is_refused_and_not_written(
+    tmp_path: Path, rig: StereoRig, curve: Nurbs
+) -> None:
+    record(tmp_path, rig, [make_state(curve, 0)])
+    other = tmp_path / "states.xml"
+    with pytest.raises(InputError, match=r"states\.xml: the name must end in \.jsonl or \.csv, or"):
+        run(ExportConfig(tmp_path, other))
+    assert not other.exists()
+    for config in (ExportConfig(tmp_path, other, "jsonl"), ExportConfig(tmp_path, tmp_path / "a")):
+        run(config)
+        assert config.output is not None
+        assert json.loads(config.output.read_text().splitlines()[0])["frame"] == 0
+
+
 def test_csv_holds_the_same_numbers(tmp_path: Path, rig: StereoRig, curve: Nurbs) -> None:
     record(tmp_path, rig, [make_state(curve, i) for i in range(4)])
     run(ExportConfig(tmp_path, tmp_path / "states.csv"))
