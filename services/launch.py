@@ -89,6 +89,13 @@ def run(config: RunConfig | DemoConfig) -> None:
     if isinstance(config, DemoConfig):
         demo = InputConfig(f"stage:{config.scenario}", fps=30.0, frames=600)
         config = RunConfig(demo, config.service, view=config.view)
+    if config.view:
+        from services.view import check_display  # late, as few need what the viewer does
+
+        check_display(
+            "leave --view out, and watch with `suturetrack console` or `suturetrack view --web`; "
+            "all is recorded"
+        )
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = _WIDTH

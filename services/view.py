@@ -48,9 +48,8 @@ def run(config: ViewConfig) -> None:
     Raises:
         InputError: nothing to show, or no display to show it on.
     """
-    has_display = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)
-    if not config.web and not has_display:
-        raise InputError("there is no display; --web shows the run in a browser")
+    if not config.web:
+        check_display("--web shows the run in a browser")
     if config.run_dir is None:
         service = ServiceConfig(rig=config.rig, zenoh=config.zenoh)
         run_service("view", service, lambda running: _follow(running.bus, config.web))
@@ -63,6 +62,13 @@ def run(config: ViewConfig) -> None:
     ).returncode
     if status:
         raise InputError(f"the Rerun viewer ended with status {status}")
+
+
+def check_display(instead: str) -> None:
+    """Raises InputError, with what to do instead, where there is no display to show a window on."""
+    displays = (os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    if sys.platform == "linux" and not any(displays):
+        raise InputError(f"there is no display; {instead}")
 
 
 def _follow(bus: Bus, web: bool) -> None:

@@ -175,6 +175,18 @@ def test_what_is_no_video_is_said_so(call: Call, calibration: Path) -> None:
     assert "not a video that can be read" in line
 
 
+@pytest.mark.parametrize("verb", [["run", "--source", STAGE], ["demo"]])
+def test_a_view_without_a_display_is_refused_before_the_run(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: list[str]
+) -> None:
+    monkeypatch.setenv("DISPLAY", "")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr("services.launch._watch", None)
+    line = complaint(call(*verb, "--view", "--run-dir", tmp_path / "run"))
+    assert "there is no display; leave --view out, and watch with `suturetrack console`" in line
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_run_folder_is_used_once(call: Call, tmp_path: Path) -> None:
     (tmp_path / "source.rrd").touch()
     line = complaint(call("run", "--source", STAGE, "--run-dir", tmp_path))
