@@ -308,12 +308,11 @@ class Client:
 
         Images and fields are read no longer than that: a controller's link has room for little else.
         """
+        self.bus.alive()  # begins to look who is there
         with self.bus.newest(topic) as reader:
             message = reader.get(_ARRIVAL_S)
         if message is None:
-            raise Unavailable(
-                f"no {topic.key}s come in which to look; does a {topic.publisher} run?"
-            )
+            raise self._unavailable(f"no {topic.key}s come in which to look")
         return message
 
     def _ask(self, question: Question[Q, A], content: Q, timeout: float) -> A:
@@ -323,14 +322,24 @@ class Client:
             raise InputError(str(error)) from error
         # The processes of a rig appear a moment after the connection was opened.
         if not self.bus.wait_for_alive(question.server, _ARRIVAL_S):
-            raise Unavailable(
-                f"no {question.server} runs on rig {self.bus.rig!r}; start one with "
-                "`suturetrack run`, or name the rig that runs"
-            )
+            raise self._unavailable(f"the {question.server} does not answer")
         try:
             return self.bus.ask(question, content, timeout)
         except NoAnswer as error:
-            raise Unavailable(f"the {question.server} does not answer: {error}") from error
+            raise self._unavailable(f"the {question.server} does not answer: {error}") from error
+
+    def _unavailable(self, what: str) -> Unavailable:
+        """The error, with the processes that are missing and how to start them."""
+        alive, rig = self.bus.alive(), self.bus.rig
+        absent = [name for name in topics.PROCESSES if name not in alive]
+        if not absent:
+            return Unavailable(what)
+        by_hand = " and ".join(f"`suturetrack {name} --rig {rig}`" for name in absent)
+        start = "`suturetrack run`" if len(absent) == len(topics.PROCESSES) else by_hand
+        return Unavailable(
+            f"{what}; no {' and no '.join(absent)} runs on rig {rig!r}; start one with {start}, "
+            "or name the rig that runs"
+        )
 
     def _listen(self) -> None:
         for state in self._reader:

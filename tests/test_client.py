@@ -332,10 +332,16 @@ def test_threads_of_a_slow_stream_are_not_gone_between_two_frames(
 
 def test_nobody_there_is_said_plainly(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.client._ARRIVAL_S", 0.05)
-    with pytest.raises(Unavailable, match="no tracker runs on rig 'rig'"):
+    nobody = (
+        "does not answer; no source and no segmenter and no tracker runs on rig 'rig'; start one"
+    )
+    with pytest.raises(Unavailable, match=f"the tracker {nobody} with `suturetrack run`"):
         stage.client.grasp(fraction=0.5)
-    with pytest.raises(Unavailable, match="no source runs"):
+    with pytest.raises(Unavailable, match=f"the source {nobody} with `suturetrack run`"):
         stage.client.calibration()
     stage.tracker.declare_alive()
-    with pytest.raises(Unavailable, match="does not answer"):
+    absent = "no source and no segmenter runs on rig 'rig'; start one with `suturetrack source"
+    with pytest.raises(Unavailable, match=f"does not answer: .*; {absent}"):
         stage.client.grasp(fraction=0.5)
+    with pytest.raises(Unavailable, match=f"no frames come in which to look; {absent}"):
+        stage.client.seed(laser=True)
