@@ -150,15 +150,24 @@ def test_a_thread_of_unknown_length_is_soon_drawn_out_in_leaps(
     assert grown_s[0] - hidden_s == pytest.approx(held_s, abs=0.1)
 
 
+def test_other_ridges_make_no_thread_shorter_at_once() -> None:
+    watch, _ = settled_watch(98.0)
+    known = KnownLength(100.0).watched(watch)
+    assert known.learned(watch, 0.1, is_clear=True).now == pytest.approx(98.0, rel=1e-3)
+    assert known.learned(watch, 0.1, is_clear=False).now > 99.9
+    assert known.learned(watch, 30.0, is_clear=False).now == pytest.approx(98.0, rel=1e-3)
+
+
 def test_what_the_border_cuts_off_makes_the_rest_no_longer() -> None:
     whole, _ = settled_watch(140.0)
     cut, never_whole = EndWatch(110.0, 0), KnownLength(110.0)
     cut.at_border = True
     known = KnownLength(140.0).watched(whole).watched(cut)
-    assert known.is_exceeded(146.0, 0.5)
-    assert not known.is_exceeded(139.0, 0.5)
+    assert known.is_missed(146.0, 0.5)
+    assert not known.is_missed(110.0, 0.5)
+    assert KnownLength(140.0).watched(whole).is_missed(134.0, 0.5)
     assert not known.is_outgrown(146.0, 0.5)
-    assert not never_whole.watched(cut).is_exceeded(146.0, 0.5)
+    assert not never_whole.watched(cut).is_missed(146.0, 0.5)
 
 
 @pytest.mark.parametrize("ahead_px", [5.0, 10.0])

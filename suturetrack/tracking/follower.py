@@ -14,6 +14,7 @@ from suturetrack.tracking.alignment import shifted, shown
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange
 from suturetrack.tracking.crowding import covered
+from suturetrack.tracking.detours import led_back
 from suturetrack.tracking.drift import Drift, HiddenEnds
 from suturetrack.tracking.end_watch import EndWatch
 from suturetrack.tracking.ends import EndStep, find_end, with_ends
@@ -47,8 +48,8 @@ _VAGUE = 0.0225
 # How long a doubtful end is held before it is cut off.
 _PATIENCE_S = 0.06
 _SOME = 0.2
-# How often ends that are not seen are looked for elsewhere.
-_REGROWN_S = 0.09
+# How often ends that are not seen are looked for elsewhere, and crowded stretches are led back.
+_REGROWN_S = _LED_BACK_S = 0.09
 # For how long a hidden end is taken to be where it was, and after how long it is gone.
 _HIDDEN_S, _GONE_S = 0.3, 2.0
 # What has to be seen of the last good curve beyond what is seen of the rest, against the length.
@@ -87,7 +88,7 @@ class Follower:
         self._lost = False
         self._certain_ns = now
         """When it was certain last where the thread runs, and for a moment before."""
-        self._doubted_ns = self._regrown_ns = -(1 << 62)
+        self._doubted_ns = self._regrown_ns = self._led_back_ns = -(1 << 62)
         self._drift = Drift()
         self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
@@ -153,6 +154,7 @@ class Follower:
             evidence, inserted, removed = further, inserted + more, removed + fewer
         if self.config.method != "paper":
             evidence = self._grow_ends_anew(images, evidence, neighbours)
+            evidence = self._lead_back(images, evidence, neighbours)
         self._seen = evidence.evenly_seen
         if evidence.share >= 0.5:
             model.seen_ns = model.capture_ns
@@ -202,7 +204,7 @@ class Follower:
         is_certain &= not (overlong or known.is_short(length))
         has_ends = bool(plain[[0, 1, -2, -1]].all())
         if is_certain and is_whole and has_ends and not (self._lost or known.is_cut):
-            known = known.learned(ends, seconds, may_grow=evidence.is_clear(plain))
+            known = known.learned(ends, seconds, is_clear=evidence.is_clear(plain))
         self.known_length = known
         if not is_certain:
             self._doubted_ns = model.capture_ns
@@ -217,7 +219,7 @@ class Follower:
         last = length_of(self.last_good)
         is_another = known.is_another(length, last, noise, is_clear=is_clear)
         self.is_crowded = bool(evidence.alone.mean() <= _ALL)
-        self.makes_detour = not is_clear and known.is_exceeded(length, noise)
+        self.makes_detour = not is_clear and known.is_missed(length, noise)
         if self._lost and (is_another or plain.mean() < 1 - ASTRAY):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
@@ -339,16 +341,38 @@ class Follower:
         others = neighbours.shown_in(images)
 
         def fitted(curve: Nurbs) -> Evidence:
-            reach_px = self.config.search_px
-            return Evidence.of(
-                gauss_newton.fit(curve, curve, images, reach_px, self.config, others)
-            )
+            return self._fitted(curve, images, others)
 
         found = regrown(model.curve, tails, known, images, fitted)
         if found is None:
             return evidence
         model.curve = found.fit.curve
         return found
+
+    def _lead_back(self, images: Images, evidence: Evidence, neighbours: Neighbours) -> Evidence:
+        """Every now and then, where other ridges run beside the thread, the curve without detours."""
+        model = self.model
+        rested_s = (model.capture_ns - self._led_back_ns) * _NS
+        if not evidence.fit.crowd.others.any() or 0 <= rested_s < _LED_BACK_S:
+            return evidence
+        self._led_back_ns = model.capture_ns
+
+        def fitted(curve: Nurbs, others: Neighbours, times: float) -> Evidence:
+            return self._fitted(curve, images, others, times)
+
+        others = neighbours.shown_in(images)
+        found = led_back(model.curve, self.known_length, self.rig, others, fitted)
+        if found is None:
+            return evidence
+        model.curve = found.fit.curve
+        return found
+
+    def _fitted(
+        self, curve: Nurbs, images: Images, others: Neighbours, times: float = 1.0
+    ) -> Evidence:
+        """A curve that was elsewhere, laid on the field."""
+        reach_px = times * self.config.search_px
+        return Evidence.of(gauss_newton.fit(curve, curve, images, reach_px, self.config, others))
 
     def _cut_doubled_ends(self) -> None:
         """Cuts off what has folded; a tip may lie on its own thread, where the curve is not too long."""

@@ -69,20 +69,24 @@ class KnownLength:
         """With no more left than `length`, as far as anybody knows."""
         return replace(self, now=length, before_cut=max(self.possible), is_cut=False)
 
-    def learned(self, ends: EndWatch, seconds: float, *, may_grow: bool) -> KnownLength:
-        """So much later; an end that is lost for a moment makes the thread no shorter."""
-        length = ends.length if may_grow else min(ends.length, self.now)
+    def learned(self, ends: EndWatch, seconds: float, *, is_clear: bool) -> KnownLength:
+        """So much later; an end that is lost for a moment makes the thread no shorter, nor do other
+        ridges that draw it aside."""
+        length = ends.length if is_clear else min(ends.length, self.now)
         longest = max(self.now, length)
-        fading = 0.0 if ends.settled else math.exp(-max(seconds, 0.0) / _FORGOTTEN_S)
+        is_told = is_clear and ends.settled
+        fading = 0.0 if is_told else math.exp(-max(seconds, 0.0) / _FORGOTTEN_S)
         return replace(self, now=length + (longest - length) * fading)
 
     def is_outgrown(self, length: float, noise: float) -> bool:
         """Whether a curve is longer than the thread ever was, by more than noise makes of it."""
         return self.is_established and length > (1 + _GROWTH) * max(self.possible) + noise
 
-    def is_exceeded(self, length: float, noise: float) -> bool:
-        """Whether a curve beside other ridges, which draw it aside, makes a detour."""
-        return self.was_established and length > (1 + _DETOUR) * self.now + noise
+    def is_missed(self, length: float, noise: float) -> bool:
+        """Whether a curve beside other ridges, which draw it aside, makes a detour or a short cut; what
+        the images' border cuts off makes it shorter, too."""
+        is_known = self.was_established if length > self.now else self.is_established
+        return is_known and abs(length - self.now) > _DETOUR * self.now + noise
 
     def is_reached(self, length: float) -> bool:
         """Whether a curve lacks nothing of the thread's own length."""
