@@ -8,12 +8,12 @@ from typing import Annotated
 
 import tyro
 
+from services.output import opened
 from services.page import page
 from services.report import show
 from services.run_folder import RunFolder
 from services.summary import summarize
 from services.tables import report_console
-from suturetrack.types import InputError
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,5 @@ def run(config: InspectConfig) -> None:
     summary = summarize(folder)
     show(summary, report_console())
     if config.html is not None:
-        try:
-            config.html.write_text(page(folder, summary), encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"cannot write {config.html}: {error.strerror}") from error
+        with opened(config.html) as file:
+            file.write(page(folder, summary))

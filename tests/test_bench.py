@@ -195,6 +195,13 @@ def test_rows_are_printed_and_written_whole(tmp_path: Path) -> None:
     assert page.count("<tr>") == 31
     assert "data:image/png;base64," in page
     assert "http" not in page
+    gone = tmp_path / "none" / "rows"
+    for write in (
+        lambda: report.write_json(gone, {"tracking": rows}),
+        lambda: report.write_page(gone, "Figures", {"tracking": rows}, {}),
+    ):
+        with pytest.raises(InputError, match="cannot write"):
+            write()
 
 
 @pytest.mark.parametrize("path", [".", "none/rows"])

@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from services.output import opened
 from suturetrack.types import InputError
 
 
@@ -55,23 +56,26 @@ def print_rows(console: Console, title: str, rows: Sequence[Any]) -> None:
 
 def check_writable(path: Path) -> None:
     """Raises InputError, before the work is done, where a file could not be written."""
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+    is_file = path.is_file() or not path.exists()
+    place = Path(os.path.realpath(path)).parent if is_file else path
+    if path.is_dir() or not os.access(place, os.W_OK):
         raise InputError(f"cannot write {path}: name a file in a folder that is there")
 
 
 def write_json(path: Path, tables: Mapping[str, Sequence[Any]]) -> None:
-    """All rows at full precision, `{table: [row, ...]}`; nan is null."""
+    """All rows at full precision, `{table: [row, ...]}`; nan is null. Raises InputError."""
     content = {
         name: [{k: _finite(v) for k, v in asdict(row).items()} for row in rows]
         for name, rows in tables.items()
     }
-    path.write_text(json.dumps(content, indent=1) + "\n")
+    with opened(path) as file:
+        file.write(json.dumps(content, indent=1) + "\n")
 
 
 def write_page(
     path: Path, title: str, tables: Mapping[str, Sequence[Any]], plots: Mapping[str, Sequence[Plot]]
 ) -> None:
-    """One HTML page without outside resources: each table with its plots above it."""
+    """One HTML page without outside resources: each table with its plots above it. Raises InputError."""
     parts = [f"<h1>{html.escape(title)}</h1>"]
     for name, rows in tables.items():
         parts.append(f"<h2>{html.escape(name)}</h2>")
@@ -86,10 +90,9 @@ def write_page(
         "table{border-collapse:collapse}td,th{padding:.2rem .6rem;border-bottom:1px solid #ddd;"
         "text-align:right}td:first-child,th:first-child{text-align:left}img{max-width:100%}"
     )
-    path.write_text(
-        f'<!doctype html><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{style}</style>" + "\n".join(parts)
-    )
+    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{style}</style>'
+    with opened(path) as file:
+        file.write(f"<!doctype html>{head}" + "\n".join(parts))
 
 
 def _picture(rows: Sequence[Any], plot: Plot) -> str:
