@@ -163,11 +163,12 @@ def test_what_the_border_cuts_off_makes_the_rest_no_longer() -> None:
     cut, never_whole = EndWatch(110.0, 0), KnownLength(110.0)
     cut.at_border = True
     known = KnownLength(140.0).watched(whole).watched(cut)
-    assert known.is_missed(146.0, 0.5)
-    assert not known.is_missed(110.0, 0.5)
-    assert KnownLength(140.0).watched(whole).is_missed(134.0, 0.5)
+    assert known.is_exceeded(146.0, 0.5)
+    assert not known.is_exceeded(139.0, 0.5)
+    assert not known.is_undercut(110.0, 0.5)
+    assert KnownLength(140.0).watched(whole).is_undercut(134.0, 0.5)
     assert not known.is_outgrown(146.0, 0.5)
-    assert not never_whole.watched(cut).is_missed(146.0, 0.5)
+    assert not never_whole.watched(cut).is_exceeded(146.0, 0.5)
 
 
 @pytest.mark.parametrize("ahead_px", [5.0, 10.0])

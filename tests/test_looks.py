@@ -562,7 +562,7 @@ def lens(height: float) -> np.ndarray:
 def test_a_curve_that_another_ridge_has_drawn_aside_is_put_right_by_a_look(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch, confidence: float, is_put_right: bool
 ) -> None:
-    truth, other = lens(1.2), lens(-0.2)
+    truth, other = lens(0.7), lens(-0.7)  # Neither bends less than the other.
 
     def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
         points = truth if field.stamp.frame else other
@@ -583,7 +583,7 @@ def test_a_curve_that_another_ridge_has_drawn_aside_is_put_right_by_a_look(
 def test_a_look_at_a_sure_curve_holds_no_recovery_up(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    truth, other = lens(1.2), lens(-0.2)
+    truth, other = lens(0.7), lens(-0.7)  # Neither bends less than the other.
     looked: list[int] = []
 
     def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:

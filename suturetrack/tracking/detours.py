@@ -22,17 +22,17 @@ _SHORTEST_PX, _END = 15.0, 0.05
 # How far away the thread has to run, what has to be seen of it there, and what may be less seen of the curve.
 _AWAY_PX, _SEEN, _LOSS = 2.0, 0.9, 0.02
 # A thread changes its bending less than a curve that leaves it and comes back.
-_CALMER = 0.6
-# How far to either side of a bridge the thread is looked for, in units of the usual reach.
-_FAR = 2.0
+_CALMER = 0.4
+# How often a bridge is laid on the field beside the old stretch.
+_ROUNDS = 2
 _PLACES = 200
 
 Stretch = tuple[float, float]
 """Parameters between which a curve may make a detour."""
 
 
-Fitted = Callable[[Nurbs, Neighbours, float], Evidence]
-"""Lays a curve on the field, clear of other threads, looking so many times as far as usual."""
+Fitted = Callable[[Nurbs, Neighbours], Evidence]
+"""Lays a curve on the field, clear of other threads."""
 
 
 def led_back(
@@ -52,14 +52,14 @@ def led_back(
         fitted: lays curves on the field.
     """
     found = None
-    now = fitted(curve, others, 1.0)
+    now = fitted(curve, others)
     for stretch in _crowded_stretches(now, rig):
-        beside = fitted(
-            _bridged(now.fit.curve, stretch), _with_stretch(others, now, stretch, rig), _FAR
-        )
-        tried = fitted(beside.fit.curve, others, 1.0)
-        if _is_better(tried, now, stretch, known, rig):
-            found = now = tried
+        tried, beside = _bridged(now.fit.curve, stretch), _with_stretch(others, now, stretch, rig)
+        for _ in range(_ROUNDS):
+            tried = fitted(tried, beside).fit.curve
+        other = fitted(tried, others)
+        if _is_better(other, now, stretch, known, rig):
+            found = now = other
     return found
 
 
@@ -119,15 +119,19 @@ def _is_better(
     """Whether another course of the stretch is seen, elsewhere, and more likely that of the thread."""
     s = tried.fit.samples.s
     is_seen = tried.seen[(stretch[0] < s) & (s < stretch[1])].mean() >= _SEEN
-    away = [
-        np.linalg.norm(there.pixels - here.pixels, axis=1).max()
-        for there, here in zip(_views(tried, stretch, rig), _views(now, stretch, rig), strict=True)
-    ]
     is_calmer = _unrest(tried.fit.curve, stretch) < _CALMER * _unrest(now.fit.curve, stretch)
+    length, noise = length_of(tried.fit.curve), tried.length_noise
     return bool(
         is_seen
         and tried.share >= now.share - _LOSS
-        and max(away) >= _AWAY_PX
         and is_calmer
-        and not known.is_missed(length_of(tried.fit.curve), tried.length_noise)
+        and _away(tried, now, stretch, rig) >= _AWAY_PX
+        and not (known.is_exceeded(length, noise) or known.is_undercut(length, noise))
     )
+
+
+def _away(tried: Evidence, now: Evidence, stretch: Stretch, rig: StereoRig) -> float:
+    """How far the stretch has moved across itself somewhere, px."""
+    both = zip(_views(tried, stretch, rig), _views(now, stretch, rig), strict=True)
+    across = [((there.pixels - here.pixels) * here.normals).sum(axis=1) for there, here in both]
+    return float(np.abs(across).max())

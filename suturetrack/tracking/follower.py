@@ -94,7 +94,8 @@ class Follower:
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
         self._share_seen = 1.0
         self.is_crowded = self.makes_detour = False
-        """Whether other ridges run beside the thread, and whether they have made the curve too long."""
+        """Whether other ridges run beside the thread, and whether they have made the curve too long or
+        too short."""
         self._comes_in = False
         """Whether the thread has been coming into the images since it was cut by their border."""
         self._leaps: Bool = np.zeros(2, bool)
@@ -219,7 +220,8 @@ class Follower:
         last = length_of(self.last_good)
         is_another = known.is_another(length, last, noise, is_clear=is_clear)
         self.is_crowded = bool(evidence.alone.mean() <= _ALL)
-        self.makes_detour = not is_clear and known.is_missed(length, noise)
+        is_off = known.is_exceeded(length, noise) or known.is_undercut(length, noise)
+        self.makes_detour = is_off and not is_clear
         if self._lost and (is_another or plain.mean() < 1 - ASTRAY):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
@@ -357,8 +359,8 @@ class Follower:
             return evidence
         self._led_back_ns = model.capture_ns
 
-        def fitted(curve: Nurbs, others: Neighbours, times: float) -> Evidence:
-            return self._fitted(curve, images, others, times)
+        def fitted(curve: Nurbs, others: Neighbours) -> Evidence:
+            return self._fitted(curve, images, others)
 
         others = neighbours.shown_in(images)
         found = led_back(model.curve, self.known_length, self.rig, others, fitted)
@@ -367,11 +369,9 @@ class Follower:
         model.curve = found.fit.curve
         return found
 
-    def _fitted(
-        self, curve: Nurbs, images: Images, others: Neighbours, times: float = 1.0
-    ) -> Evidence:
+    def _fitted(self, curve: Nurbs, images: Images, others: Neighbours) -> Evidence:
         """A curve that was elsewhere, laid on the field."""
-        reach_px = times * self.config.search_px
+        reach_px = self.config.search_px
         return Evidence.of(gauss_newton.fit(curve, curve, images, reach_px, self.config, others))
 
     def _cut_doubled_ends(self) -> None:

@@ -11,7 +11,7 @@ from suturetrack.types import Nurbs
 
 # A thread of which something is hidden has not grown by more.
 _GROWTH = 0.02
-# A thread that is not alone is not longer by more.
+# A thread that is not alone is neither longer nor shorter by more.
 _DETOUR = 0.005
 # A thread found again has the length that it had, to this part; to the other one if it is not alone.
 _TOLERANCE, _CROWDED_TOLERANCE = 0.05, 0.01
@@ -82,11 +82,13 @@ class KnownLength:
         """Whether a curve is longer than the thread ever was, by more than noise makes of it."""
         return self.is_established and length > (1 + _GROWTH) * max(self.possible) + noise
 
-    def is_missed(self, length: float, noise: float) -> bool:
-        """Whether a curve beside other ridges, which draw it aside, makes a detour or a short cut; what
-        the images' border cuts off makes it shorter, too."""
-        is_known = self.was_established if length > self.now else self.is_established
-        return is_known and abs(length - self.now) > _DETOUR * self.now + noise
+    def is_exceeded(self, length: float, noise: float) -> bool:
+        """Whether a curve beside other ridges, which draw it aside, makes a detour."""
+        return self.was_established and length > (1 + _DETOUR) * self.now + noise
+
+    def is_undercut(self, length: float, noise: float) -> bool:
+        """Whether it makes a short cut; what the images' border cuts off makes it shorter, too."""
+        return self.is_established and length < (1 - _DETOUR) * self.now - noise
 
     def is_reached(self, length: float) -> bool:
         """Whether a curve lacks nothing of the thread's own length."""

@@ -342,7 +342,7 @@ class Thread:
             return False
         known, curve = self.follower.known_length, self.follower.model.curve
         has_length = not known.is_another(state.length, known.now, 0.0, is_clear=False)
-        has_length &= not known.is_missed(state.length, 0.0)
+        has_length &= not known.is_exceeded(state.length, 0.0)
         likely = 0.0 if self.follower.makes_detour else _LIKELY
         return has_length and self._sureness.outweighs(
             found.confidence, state.curve, curve, likely=likely
