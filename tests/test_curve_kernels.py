@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from numba.core.dispatcher import Dispatcher
 
 from suturetrack import kernels, nurbs
@@ -145,12 +144,50 @@ def test_responses_are_bilinear_and_blind_to_the_sign_of_the_field(
 
 
 @given(
-    hnp.arrays(np.float64, (4, 5), elements=st.floats(0, 1)), st.floats(0, 0.5), st.integers(1, 4)
+    st.integers(0, 10_000), st.integers(1, 9), st.integers(1, 12), st.sampled_from([0.0, 0.4, 1.0])
 )
-def test_the_best_path_is_the_best_of_all(gain: np.ndarray, stiffness: float, reach: int) -> None:
+def test_what_lies_beside_a_curve_is_what_the_twins_see(
+    seed: int, height: int, width: int, leniency: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    field = rng.normal(size=(height, width, 2)) * (rng.random((height, width, 1)) > 0.2)
+    field = field.astype(np.float32)
+    pixels = rng.uniform(-1.5, (width + 0.5, height + 0.5), (12, 2))
+    angles = rng.uniform(0, 2 * np.pi, 12)
+    # Some places lie on the pixels, those of the border among them.
+    pixels[::2], angles[::4] = np.round(pixels[::2]), 0.0
+    tangents, offsets = np.c_[np.cos(angles), np.sin(angles)], np.arange(-3, 3.1, 0.5)
+    np.testing.assert_allclose(
+        search.magnitudes(field, pixels),
+        [reference.magnitude(field, *pixel) for pixel in pixels],
+        atol=1e-5,
+    )
+    np.testing.assert_allclose(
+        search.responses(field, pixels, tangents),
+        [reference.response(field, *p, t) for p, t in zip(pixels, tangents, strict=True)],
+        atol=1e-5,
+    )
+    np.testing.assert_allclose(
+        search.normal_profiles(field, pixels, tangents, offsets, leniency),
+        reference.normal_profiles(field, pixels, tangents, offsets, leniency),
+        atol=1e-5,
+    )
+
+
+@given(
+    st.integers(0, 10_000),
+    st.integers(1, 4),
+    st.integers(1, 5),
+    st.floats(0, 0.5),
+    st.integers(1, 4),
+)
+def test_the_best_path_is_the_best_of_all(
+    seed: int, count: int, width: int, stiffness: float, reach: int
+) -> None:
+    gain = np.random.default_rng(seed).integers(0, 21, (count, width)) / 20
     path = search.best_path(gain, stiffness, reach)
     steps = np.diff(path)
-    worth = gain[np.arange(4), path].sum() - stiffness * (steps**2).sum()
+    worth = gain[np.arange(count), path].sum() - stiffness * (steps**2).sum()
     assert np.all(np.abs(steps) <= reach)
     assert worth == pytest.approx(reference.best_path(gain, stiffness, reach))
 
@@ -162,6 +199,17 @@ def test_peaks_are_found_below_the_sample(centre: float, sigma: float) -> None:
     position, height = search.peaks(profile, np.array([10]), 3)
     assert 0.5 * (position[0] - 10) == pytest.approx(centre, abs=0.05)
     assert height[0] > 0.95
+
+
+@given(st.integers(0, 10_000), st.integers(1, 16), st.integers(1, 3))
+def test_peaks_are_those_of_fitted_parabolas(seed: int, width: int, half: int) -> None:
+    rng = np.random.default_rng(seed)
+    profiles, path = rng.normal(0.3, 1, (20, width)), rng.integers(0, width, 20)
+    profiles[::2] = np.cumsum(profiles[::2], axis=1)
+    for found, wanted in zip(
+        search.peaks(profiles, path, half), reference.peaks(profiles, path, half), strict=True
+    ):
+        np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
 def test_no_peak_at_the_rim_or_on_nothing() -> None:
@@ -188,6 +236,15 @@ def test_short_runs_are_dropped() -> None:
     flags = np.array([1, 1, 0, 1, 1, 1, 0, 1], bool)
     kept = search.solid(flags, np.full(8, 2.0), 5.0)
     np.testing.assert_array_equal(kept, [0, 0, 0, 1, 1, 1, 0, 0])
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 8))), st.integers(0, 20))
+def test_runs_are_as_long_as_those_of_the_twin(steps: list[tuple[bool, int]], least: int) -> None:
+    flags = np.array([flag for flag, _ in steps], bool)
+    lengths = np.array([length for _, length in steps], float)
+    np.testing.assert_array_equal(
+        search.solid(flags, lengths, float(least)), boundary_reference.solid(flags, lengths, least)
+    )
 
 
 @given(st.integers(0, 10_000))

@@ -1,4 +1,4 @@
-"""Literal twin of the kernel that reads where a thread ends."""
+"""Literal twins of the kernels that read where a thread, or a run of what is seen of it, ends."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from suturetrack.types import Bool, Float64
 def outer_boundary(x: Float64, mean: Float64, least: Float64) -> tuple[float, float]:
     """See `suturetrack.kernels.boundary.outer_boundary`."""
     step = x[1] - x[0]
-    runs = [run for run in _runs((x <= 0) & (mean > 0.2)) if step * len(run) >= 8.0]
-    if not runs:
+    places = np.flatnonzero(solid((x <= 0) & (mean > 0.2), np.full(len(x), step), 8.0))
+    if not len(places):
         return np.nan, np.nan
-    last = runs[-1][-1]
+    last = places[-1]
     plateau = float(np.median(mean[max(last - 24, 0) : last - 6]))
     level = 0.43 * plateau
     last = max(np.flatnonzero(mean[: last + 1] >= level), default=0)
@@ -34,9 +34,12 @@ def outer_boundary(x: Float64, mean: Float64, least: Float64) -> tuple[float, fl
     return end, level
 
 
-def _runs(flags: Bool) -> list[np.ndarray]:
-    places = np.flatnonzero(flags)
-    return [r for r in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(r)]
+def solid(flags: Bool, lengths: Float64, least: float) -> Bool:
+    """See `suturetrack.kernels.search.solid`."""
+    places, kept = np.flatnonzero(flags), np.zeros_like(flags)
+    for run in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):
+        kept[run] = lengths[run].sum() >= least
+    return kept
 
 
 def _crossing(x: Float64, values: Float64, last: int, level: float) -> float:

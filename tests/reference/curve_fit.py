@@ -30,18 +30,43 @@ def normal_equations(
     return matrix, right
 
 
-def response(field: np.ndarray, u: float, v: float, tangent: np.ndarray) -> float:
-    """(t.V)^2 / |V| at one place, from its four pixels."""
-    height, width, _ = field.shape
+def bilinear(values: np.ndarray, u: float, v: float) -> float:
+    """Value of (H, W) at a place, from its four pixels; 0 outside the image."""
+    height, width = values.shape
     if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
         return 0.0
-    total = 0.0
-    for row, column in itertools.product(range(height), range(width)):
-        share = max(0.0, 1 - abs(u - column)) * max(0.0, 1 - abs(v - row))
-        vector = field[row, column].astype(float)
-        if share > 0 and np.any(vector):
-            total += share * (vector @ tangent) ** 2 / np.linalg.norm(vector)
-    return total
+    down = np.maximum(1 - np.abs(v - np.arange(height)), 0)
+    right = np.maximum(1 - np.abs(u - np.arange(width)), 0)
+    return float(down @ values @ right)
+
+
+def magnitude(field: np.ndarray, u: float, v: float) -> float:
+    """|V| at one place."""
+    return bilinear(np.linalg.norm(field.astype(float), axis=2), u, v)
+
+
+def response(field: np.ndarray, u: float, v: float, tangent: np.ndarray) -> float:
+    """(t.V)^2 / |V| at one place."""
+    length = np.linalg.norm(field.astype(float), axis=2)
+    along = field @ tangent
+    return bilinear(np.where(length > 0, along**2 / np.maximum(length, 1e-30), 0), u, v)
+
+
+def normal_profiles(
+    field: np.ndarray,
+    pixels: np.ndarray,
+    tangents: np.ndarray,
+    offsets: np.ndarray,
+    leniency: float,
+) -> np.ndarray:
+    """See `kernels.search.normal_profiles`."""
+    profiles = np.empty((len(pixels), len(offsets)))
+    for k, (pixel, tangent) in enumerate(zip(pixels, tangents, strict=True)):
+        for m, offset in enumerate(offsets):
+            u, v = pixel + offset * np.array([-tangent[1], tangent[0]])
+            along, any_way = response(field, u, v, tangent), magnitude(field, u, v)
+            profiles[k, m] = (1 - leniency) * along + leniency * any_way
+    return profiles
 
 
 def best_path(gain: np.ndarray, stiffness: float, reach: int) -> float:
@@ -54,6 +79,23 @@ def best_path(gain: np.ndarray, stiffness: float, reach: int) -> float:
             value = gain[np.arange(count), list(path)].sum() - stiffness * (steps**2).sum()
             best = max(best, float(value))
     return best
+
+
+def peaks(profiles: np.ndarray, path: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
+    """See `kernels.search.peaks`; between two summits the way is up the later one."""
+    position, height = np.full(len(path), np.nan), np.empty(len(path))
+    for k, (profile, i) in enumerate(zip(profiles, path, strict=True)):
+        walls = np.r_[-np.inf, profile, -np.inf]
+        forth = np.flatnonzero(np.diff(walls[i + 1 :]) <= 0)[0]
+        back = np.flatnonzero(np.diff(walls[: i + 2])[::-1] >= 0)[0]
+        summit = i + forth if forth else i - back
+        height[k] = profile[summit]
+        if half <= summit < len(profile) - half and height[k] > 0:
+            around = profile[summit - half : summit + half + 1]
+            bend, slope, _ = np.polyfit(np.arange(-half, half + 1), around, 2)
+            if bend < 0:
+                position[k] = summit + np.clip(-slope / (2 * bend), -1, 1)
+    return position, height
 
 
 def best_line(
