@@ -1,4 +1,4 @@
-"""Eq. (3) and the best path of disparities, word for word."""
+"""Eq. (3), the costs of disparities and those of a path through them, word for word."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 
 from suturetrack.types import Float32, Float64
+from tests.reference.curve_fit import response
 
 
 def grow(magnitude: Float32, u: int, v: int, rho: float, low: float) -> Float64:
@@ -27,6 +28,24 @@ def grow(magnitude: Float32, u: int, v: int, rho: float, low: float) -> Float64:
                     cost[y, x] = there
                     changed = True
     return cost
+
+
+def matching_costs(
+    field: Float32,
+    pixels: Float64,
+    tangents: Float64,
+    first: float,
+    step: float,
+    count: int,
+    level: float,
+) -> Float64:
+    """See `suturetrack.kernels.matching.matching_costs`."""
+    costs = np.full((len(pixels), count), 0.5)
+    for k, state in np.ndindex(costs.shape):
+        u, v = pixels[k, 0] - first - step * state, pixels[k, 1]
+        if 0 <= u <= field.shape[1] - 1:
+            costs[k, state] = max(1 - response(field, u, v, tangents[k]) / level, 0)
+    return costs
 
 
 def path_cost(costs: Float32, states: tuple[int, ...], penalty: float) -> float:
