@@ -6,9 +6,12 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from skimage.measure import euler_number, label
 
 from suturetrack.kernels import crest, growth, matching
+from suturetrack.types import Bool
+from tests.reference import crest as crest_reference
 from tests.reference import growth as reference
 
 
@@ -70,6 +73,47 @@ def test_the_cheapest_path_is_the_cheapest_of_all(
     best = min(reference.path_cost(costs, p, penalty) for p in possible)
     assert tuple(states) in possible
     assert reference.path_cost(costs, tuple(states), penalty) == pytest.approx(best, abs=1e-5)
+
+
+SIZES = [(24, 31), (3, 9), (2, 2), (1, 5)]
+
+
+def blots(seed: int, size: tuple[int, int]) -> Bool:
+    """Noise of spots of several pixels, up to the border."""
+    noise = np.random.default_rng(seed).normal(size=size)
+    return gaussian_filter(noise, 1.0) > 0.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("size", SIZES)
+def test_crest_pixels_are_those_of_the_twin(seed: int, size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(seed)
+    field = gaussian_filter(rng.normal(size=(*size, 2)), (1.0, 1.0, 0.0)).astype(np.float32)
+    magnitude = np.linalg.norm(field, axis=2)
+    found = crest.crest_pixels(field, magnitude, 0.2)
+    np.testing.assert_array_equal(found, crest_reference.crest_pixels(field, magnitude, 0.2))
+    assert found.any() or min(size) < 10
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("size", SIZES)
+def test_thinning_leaves_what_the_twin_leaves(seed: int, size: tuple[int, int]) -> None:
+    mask = blots(seed, size)
+    magnitude = np.random.default_rng(seed).uniform(0, 1, size).astype(np.float32)
+    thinned = mask.copy()
+    crest.thin(thinned, magnitude)
+    np.testing.assert_array_equal(thinned, crest_reference.thin(mask, magnitude))
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("size", SIZES)
+def test_chains_are_those_of_the_twin(seed: int, size: tuple[int, int]) -> None:
+    mask = crest_reference.thin(blots(seed, size), np.ones(size, np.float32))
+    # Some of it touches the border, or itself.
+    mask |= np.random.default_rng(seed).random(size) < 0.1
+    pixels, starts = crest.trace_chains(mask)
+    found = [pixels[a:b].tolist() for a, b in itertools.pairwise(starts)]
+    assert found == [[list(place) for place in chain] for chain in crest_reference.chains(mask)]
 
 
 @pytest.mark.parametrize("seed", range(8))

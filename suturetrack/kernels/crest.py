@@ -36,8 +36,11 @@ def _bilinear(image: Float32, u: float, v: float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def thin(mask: Bool, magnitude: Float32) -> None:
-    """Takes away, weakest first, the pixels of `mask` that neither end nor hold a line together."""
-    height, width = mask.shape
+    """Takes away, weakest first, the pixels of `mask` that neither end nor hold a line together.
+
+    The border of the image is cleared.
+    """
+    mask[0] = mask[-1] = mask[:, 0] = mask[:, -1] = False
     ys, xs = np.nonzero(mask)
     values = np.empty(len(ys), np.float32)
     for k in range(len(ys)):
@@ -48,11 +51,7 @@ def thin(mask: Bool, magnitude: Float32) -> None:
         changed = False
         for k in order:
             y, x = ys[k], xs[k]
-            if not mask[y, x]:
-                continue
-            if y == 0 or x == 0 or y == height - 1 or x == width - 1:
-                mask[y, x] = False
-            elif _removable(mask, y, x):
+            if mask[y, x] and _removable(mask, y, x):
                 mask[y, x] = False
                 changed = True
 
