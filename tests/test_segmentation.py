@@ -139,11 +139,40 @@ def test_vectors_at_right_angles_are_subtracted(seed: int) -> None:
     np.testing.assert_array_equal(out, reference.blur_angles(vectors.astype(float), kernel))
 
 
-@given(st.integers(0, 2**32 - 1), st.floats(0.5, 0.999))
-def test_the_quantile_is_numpys(seed: int, share: float) -> None:
-    values = np.random.default_rng(seed).gamma(0.5, 30, (40, 64)).astype(np.float32)
-    lowest, highest = np.quantile(values[:, ::2], [share - 2e-3, min(share + 2e-3, 1)])
-    assert lowest * 0.99 <= ridge.quantile(values, share) <= highest * 1.01
+@pytest.mark.parametrize("size", [(21, 30), (4, 9), (1, 6), (7, 1)])
+@pytest.mark.parametrize("signs", [(1, 1), (-1, -1), (-1, 1)])
+def test_the_strength_is_that_of_every_fourth_row(
+    size: tuple[int, int], signs: tuple[int, int]
+) -> None:
+    height, width = size
+    plane = np.random.default_rng(3).uniform(0, 255, size).astype(np.float32)
+    out = np.empty((*size, 2), np.float32)
+    strength = np.empty(((height + 3) // 4, width), np.float32)
+    taps, kernel = ridge.taps_of((1.2,)), gaussian_kernel(1.0)
+    ridge.ridge_field(plane, *taps, (2.0, 1e-4), signs, kernel, out, strength)
+    rows = np.minimum(np.arange(3, height + 3, 4), height - 1)
+    twin = reference.strength(plane, 1.2, signs)[rows]
+    np.testing.assert_allclose(strength, twin, rtol=1e-4)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 12))
+def test_of_two_fields_the_longer_vectors_are_kept(seed: int, height: int, width: int) -> None:
+    rng = np.random.default_rng(seed)
+    vectors, kept = rng.normal(size=(2, height, width, 2)).astype(np.float32)
+    same = rng.random((height, width)) < 0.2
+    vectors[same] = -kept[same]
+    twin = reference.strongest([kept, vectors])
+    ridge.keep_longer(vectors, kept)
+    np.testing.assert_array_equal(kept, twin)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 64), st.floats(0.5, 0.999))
+def test_the_quantile_is_within_0_4_percent(
+    seed: int, height: int, width: int, share: float
+) -> None:
+    values = np.random.default_rng(seed).gamma(0.5, 30, (height, width)).astype(np.float32)
+    twin = reference.quantile(values, share)
+    assert ridge.quantile(values, share) == pytest.approx(twin, rel=0.004)
 
 
 def test_the_quantile_of_nothing_is_nothing() -> None:

@@ -28,8 +28,8 @@ def correlate(plane, taps_v, taps_u):
     return sum(t * rows[:, k : k + plane.shape[1]] for k, t in enumerate(taps_u))
 
 
-def ridge_vectors(plane, sigma, beta, c, polarity):
-    """Eq. (1): (H, W, 2)."""
+def curvatures(plane, sigma):
+    """lambda_1, lambda_2 and v_1 of the Hessian: (H, W), (H, W) and (H, W, 2)."""
     plane = np.asarray(plane, np.float64)
     g, g1, g2 = gaussian_derivatives(sigma)
     hessian = np.empty((*plane.shape, 2, 2))
@@ -40,6 +40,19 @@ def ridge_vectors(plane, sigma, beta, c, polarity):
     order = np.argsort(np.abs(values), axis=-1)
     lambda_1, lambda_2 = np.moveaxis(np.take_along_axis(values, order, -1), -1, 0)
     v_1 = np.take_along_axis(directions, order[..., None, :1], -1)[..., 0]
+    return lambda_1, lambda_2, v_1
+
+
+def strength(plane, sigma, signs):
+    """S^2 of eq. (1), 0 where the sign of lambda_2 is not in the closed range: (H, W)."""
+    lambda_1, lambda_2, _ = curvatures(plane, sigma)
+    sign = np.sign(lambda_2)
+    return np.where((sign >= signs[0]) & (sign <= signs[1]), lambda_1**2 + lambda_2**2, 0)
+
+
+def ridge_vectors(plane, sigma, beta, c, polarity):
+    """Eq. (1): (H, W, 2)."""
+    lambda_1, lambda_2, v_1 = curvatures(plane, sigma)
     v_1 = np.where((v_1[..., 1:] < 0) | ((v_1[..., 1:] == 0) & (v_1[..., :1] < 0)), -v_1, v_1)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(lambda_1 / lambda_2)
@@ -57,6 +70,12 @@ def strongest(fields):
     fields = np.stack(fields)
     best = np.argmax(np.linalg.norm(fields, axis=-1), axis=0)
     return np.take_along_axis(fields, best[None, ..., None], 0)[0]
+
+
+def quantile(values, share):
+    """The value below which `share` of every second column lie."""
+    every = np.sort(values[:, ::2], axis=None)
+    return every[-math.ceil((1 - share) * len(every))]
 
 
 def blur_angles(v_r, kernel):
