@@ -17,6 +17,23 @@ def design(s: np.ndarray, knots: np.ndarray, times: int = 0) -> np.ndarray:
     return np.stack([BSpline(knots, np.eye(count)[i], 3)(s, times) for i in range(count)], axis=1)
 
 
+def even_samples(knots: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """See `kernels.spline.even_samples`."""
+    spans = list(itertools.pairwise(np.unique(knots)))
+    s = [np.linspace(a, b, 2 * count + 1)[1::2] for a, b in spans]
+    return np.concatenate(s), np.repeat([(b - a) / count for a, b in spans], count)
+
+
+def arc_length(knots: np.ndarray, control_points: np.ndarray) -> float:
+    """See `kernels.spline.arc_length`."""
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    total = 0.0
+    for a, b in itertools.pairwise(np.unique(knots)):
+        slope = design((a + b) / 2 + (b - a) / 2 * nodes, knots, 1) @ control_points
+        total += (b - a) / 2 * float(weights @ np.linalg.norm(slope, axis=1))
+    return total
+
+
 def normal_equations(
     a: np.ndarray, information: np.ndarray, pull: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
