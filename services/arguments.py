@@ -36,7 +36,7 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str]) -> T:
             return tyro.cli(kind, prog=prog, args=arguments)
     except SystemExit as ended:
         if ended.code:
-            fault = _in_one_line(said.getvalue()).replace(f"from {prog}: ", "")
+            fault = _in_one_line(said.getvalue()).replace(f"from {prog}: ", "") or said.getvalue()
             print(f"{prog}: {fault}; see `{prog} --help`", file=sys.stderr)
         raise
 
