@@ -469,6 +469,17 @@ def test_looks_settle_doubts_about_a_curve_of_one_length_that_one_finds_likely(
     assert sureness.is_sure == is_sure
 
 
+@pytest.mark.parametrize(("confidence", "is_sure"), [(0.08, True), (0.03, False)])
+def test_a_hopeless_look_settles_no_doubts(
+    rig: StereoRig, confidence: float, is_sure: bool
+) -> None:
+    first = replace(look_at(rig, thread(0.0), 0.45), doubts=(((0.9, 0.5),), ()))
+    second = replace(look_at(rig, thread(0.6), confidence), doubts=(((0.4, 0.5),), ()))
+    sureness = Sureness(first, first.curve, 0, rig)
+    assert not sureness.weigh(second, second.curve)
+    assert sureness.is_sure == is_sure
+
+
 @pytest.mark.parametrize("stays", [True, False])
 def test_a_doubt_that_stays_is_not_voted_down(rig: StereoRig, stays: bool) -> None:
     looks = [look_at(rig, thread(0.6 * turn), 0.4) for turn in range(8)]

@@ -21,7 +21,7 @@ _LIKELY = 0.35
 _PLENTY = 3.0
 # Confidence of the first look that needs no second one.
 _AT_ONCE = 0.75
-# Votes below which it is not worth looking from.
+# Votes below which a curve is not worth looking from, and a look settles no doubts.
 _HOPELESS = 0.01
 # What the doubts that no look has settled leave of a curve that is sure, and how far apart two doubts
 # about one place are, along curves that differ in length by no more.
@@ -130,7 +130,7 @@ class Sureness:
         if is_outvoted:
             self._doubts, self.confidence = None, confidence
             self._settle(found)
-        elif agrees:
+        elif agrees and _votes(confidence) >= _HOPELESS:
             self.confidence = max(self.confidence, confidence)
             left = self._settle(found)
             together = max(self._evidence, self._votes >= _ENOUGH) * left
