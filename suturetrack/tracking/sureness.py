@@ -25,7 +25,7 @@ _AT_ONCE = 0.75
 _HOPELESS = 0.01
 # What the doubts that no look has settled leave of a curve that is sure, and how far apart two doubts
 # about one place are, along curves that differ in length by no more.
-_TOGETHER, _SAME_PLACE, _SAME_LENGTH = 0.6, 0.05, 0.025
+_TOGETHER, _SAME_PLACE, _SAME_LENGTH = 0.6, 0.12, 0.025
 # Two looks see the same if they are nowhere further apart, and another thing if they are somewhere.
 _SAME_PX, _OTHER_PX = 5.0, 15.0
 # How much the thread has to bend between two looks that both count.
