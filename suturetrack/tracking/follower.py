@@ -220,8 +220,8 @@ class Follower:
         last = length_of(self.last_good)
         is_another = known.is_another(length, last, noise, is_clear=is_clear)
         self.is_crowded = bool(evidence.alone.mean() <= _ALL)
-        is_off = known.is_exceeded(length, noise) or known.is_undercut(length, noise)
-        self.makes_detour = is_off and not is_clear
+        is_longer = not is_clear and known.is_exceeded(length, noise)
+        self.makes_detour = is_longer or (not is_clear and known.is_undercut(length, noise))
         if self._lost and (is_another or plain.mean() < 1 - ASTRAY):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
@@ -229,7 +229,7 @@ class Follower:
         is_vague |= any(self._hidden.for_longer_than(_HIDDEN_S))
         is_vague |= bool(self._leaps.any()) and not known.is_reached(length)
         is_vague |= bool(np.sqrt(np.mean(evidence.sigma**2)) > _VAGUE * length)
-        if status is Status.TRACKING and (is_vague or self.makes_detour):
+        if status is Status.TRACKING and (is_vague or is_longer):
             return Status.OCCLUDED
         return status
 
