@@ -36,12 +36,8 @@ _REASSURANCE = 0.3
 """Share of its lead over the next best way that the price of a merge is less doubtful by."""
 _STRAIN = 1.5
 """How much of the confidence is lost with each unit of doubt that is left of the price."""
-_RUNS_ON = 0.75
+_RUNS_ON = 0.55
 """Price of a merge below which an end might as well run on."""
-_MET, _PASSED = 0.25, 0.8
-"""What an end beside another ridge leaves of the confidence, where it might run on and where it would have to
-bend too much. Of such ends of 512 threads (clutter, two-threads, crossings, knot), 3 of 19 were right
-below that price, and 18 of 20 above."""
 _GAP, _GAP_SAMPLES = 0.85, 13
 """Least ||V|| between an end and another strand, against both, below which a gap is seen there."""
 _SEPARATE_PX = 4.2
@@ -143,7 +139,7 @@ def _at_tips(joints: Joints, entries: list[int], ridges: Ridges) -> list[tuple[i
     for tip in (entries[0], entries[-1] ^ 1):
         if _runs_into_another(joints, tip, entries, ridges):
             on = min((joints.price[tip, j] for j in within.get(tip, ())), default=np.inf)
-            rest = _MET if on < _RUNS_ON else _PASSED
+            rest = 0.25 if on < _RUNS_ON else 0.4
             found.append((tip, "an end beside another ridge", rest))
     return found
 
