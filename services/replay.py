@@ -9,7 +9,7 @@ import time
 import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -94,33 +94,15 @@ def run(config: ReplayConfig) -> None:
             f"{config.run} was recorded {level}: its frames are JPEG, results may differ a little"
         )
     rig = folder.rig()
-    with _undone_when_it_fails(new):
-        try:
-            new.mkdir(parents=True, exist_ok=True)
-            write_config(parameters, new / "config.toml")
-            save_calibration(new / "calibration.yaml", rig)
-        except OSError as error:
-            raise InputError(f"run folder {new}: {error.strerror}") from error
-        service = ServiceConfig(run_dir=new, recording=config.recording, lockstep=True)
-        _replay(folder, parameters, service, config.from_)
-    print(f"Replayed to {new}; compare: suturetrack compare {config.run} {new}")
-
-
-@contextmanager
-def _undone_when_it_fails(run_dir: Path) -> Iterator[None]:
-    """Removes what a replay that fails has made: files in the folder, and folders."""
-    folders = [folder for folder in (run_dir, *run_dir.parents) if not folder.exists()]
-    files = set(run_dir.iterdir()) if run_dir.is_dir() else set()
     try:
-        yield
-    except BaseException:
-        with suppress(OSError):
-            for file in set(run_dir.iterdir()) - files:
-                file.unlink()
-        with suppress(OSError):
-            for folder in folders:
-                folder.rmdir()
-        raise
+        new.mkdir(parents=True, exist_ok=True)
+        write_config(parameters, new / "config.toml")
+        save_calibration(new / "calibration.yaml", rig)
+    except OSError as error:
+        raise InputError(f"run folder {new}: {error.strerror}") from error
+    service = ServiceConfig(run_dir=new, recording=config.recording, lockstep=True)
+    _replay(folder, parameters, service, config.from_)
+    print(f"Replayed to {new}; compare: suturetrack compare {config.run} {new}")
 
 
 def changed(parameters: Parameters, changes: Iterable[str]) -> Parameters:

@@ -223,17 +223,11 @@ def test_what_cannot_be_replayed_is_said(tmp_path: Path, recorded: Path) -> None
         run(ReplayConfig(recorded, recorded / "config.toml" / "new"))
 
 
-def test_a_seed_that_is_not_found_by_the_end_fails_a_replay_too_and_nothing_is_left_of_it(
+def test_a_seed_that_is_not_found_by_the_end_fails_a_replay_too(
     tmp_path: Path, recorded: Path
 ) -> None:
-    given = tmp_path / "given"
-    given.mkdir()
-    (given / "notes.txt").touch()
-    for folder in (tmp_path / "new" / "run", given):
-        with pytest.raises(InputError, match=r"seed \(5\.0, 5\.0\)"):
-            run(ReplayConfig(recorded, folder, set=("seed=[[5.0, 5.0]]",)))
-    left = {path.relative_to(tmp_path) for path in tmp_path.rglob("*")}
-    assert left == {Path("given"), Path("given/notes.txt")}
+    with pytest.raises(InputError, match=r"seed \(5\.0, 5\.0\)"):
+        run(ReplayConfig(recorded, tmp_path / "new", set=("seed=[[5.0, 5.0]]",)))
 
 
 def test_a_recording_that_tells_nothing_of_itself_is_not_replayed(
