@@ -30,7 +30,6 @@ _PLACES = 200
 Stretch = tuple[float, float]
 """Parameters between which a curve may make a detour."""
 
-
 Fitted = Callable[[Nurbs, Neighbours], Evidence]
 """Lays a curve on the field, clear of other threads."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -340,16 +341,8 @@ class Follower:
         if not (tails and known.is_established) or 0 <= rested_s < _REGROWN_S:
             return evidence
         self._regrown_ns = model.capture_ns
-        others = neighbours.shown_in(images)
-
-        def fitted(curve: Nurbs) -> Evidence:
-            return self._fitted(curve, images, others)
-
-        found = regrown(model.curve, tails, known, images, fitted)
-        if found is None:
-            return evidence
-        model.curve = found.fit.curve
-        return found
+        fitted = partial(self._fitted, images, others=neighbours.shown_in(images))
+        return self._taken(regrown(model.curve, tails, known, images, fitted), evidence)
 
     def _lead_back(self, images: Images, evidence: Evidence, neighbours: Neighbours) -> Evidence:
         """Every now and then, where other ridges run beside the thread, the curve without detours."""
@@ -358,21 +351,21 @@ class Follower:
         if not evidence.fit.crowd.others.any() or 0 <= rested_s < _LED_BACK_S:
             return evidence
         self._led_back_ns = model.capture_ns
-
-        def fitted(curve: Nurbs, others: Neighbours) -> Evidence:
-            return self._fitted(curve, images, others)
-
-        others = neighbours.shown_in(images)
+        others, fitted = neighbours.shown_in(images), partial(self._fitted, images)
         found = led_back(model.curve, self.known_length, self.rig, others, fitted)
-        if found is None:
-            return evidence
-        model.curve = found.fit.curve
-        return found
+        return self._taken(found, evidence)
 
-    def _fitted(self, curve: Nurbs, images: Images, others: Neighbours) -> Evidence:
+    def _fitted(self, images: Images, curve: Nurbs, others: Neighbours) -> Evidence:
         """A curve that was elsewhere, laid on the field."""
         reach_px = self.config.search_px
         return Evidence.of(gauss_newton.fit(curve, curve, images, reach_px, self.config, others))
+
+    def _taken(self, found: Evidence | None, evidence: Evidence) -> Evidence:
+        """Goes on with the curve that was found instead, if any."""
+        if found is None:
+            return evidence
+        self.model.curve = found.fit.curve
+        return found
 
     def _cut_doubled_ends(self) -> None:
         """Cuts off what has folded; a tip may lie on its own thread, where the curve is not too long."""
