@@ -114,7 +114,7 @@ class Monitor:
             cells = [name, *(f"{s:.1f}" for s in shares), number(mean, 2), number(sigma, 2)]
             if with_truth:
                 true, _ = _mean_and_sigma(thread.true_mm)
-                cells += [number(true, 2), number(100 * (mean - true) / true, 2)]
+                cells += [number(true, 2), number(100 * (mean - true) / true, 2, signed=True)]
             table.add_row(*cells)
         return table
 

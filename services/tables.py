@@ -24,6 +24,6 @@ def new_table(title: str, first: str, *others: str) -> Table:
     return made
 
 
-def number(value: float, digits: int) -> str:
-    """The number, or a dash for nan."""
-    return f"{value:.{digits}f}" if value == value else "-"
+def number(value: float, digits: int, *, signed: bool = False) -> str:
+    """The number, with a plus where it is `signed`, or a dash for nan."""
+    return f"{value:{'+' if signed else '-'}.{digits}f}" if value == value else "-"

@@ -11,9 +11,14 @@ from services.bus import Bus
 from services.memory_transport import Hub
 from services.messages import Latency
 from services.monitor import Monitor
+from services.tables import number
 from suturetrack.tracking.thread import not_found
 from suturetrack.types import Nurbs, Stamp, Status, Truth
 from tests.test_doctor import HEALTHY
+
+
+def test_errors_have_signs() -> None:
+    assert [number(x, 2, signed=True) for x in (0.5, -0.5, np.nan)] == ["+0.50", "-0.50", "-"]
 
 
 def test_what_nothing_was_measured_of_has_no_figures(curve: Nurbs) -> None:
