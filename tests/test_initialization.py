@@ -406,6 +406,31 @@ def look_at(strands: list[Float64], seed: Float64, rig: StereoRig) -> Initializa
     return initialize(field_of(left, right, rig), rig, Seed(pixel=(float(u), float(v))))
 
 
+@pytest.mark.parametrize(
+    ("away_px", "other", "is_shared"),
+    [(0, True, True), (4, True, True), (40, True, False), (0, False, False)],
+)
+def test_a_seed_where_two_threads_cross_may_mean_either(
+    rig: StereoRig, away_px: int, other: bool, is_shared: bool
+) -> None:
+    t = np.linspace(0, 1, 500)
+    one = np.c_[310 + 60 * t, 60 + 360 * t]
+    across = np.c_[180 + 320 * t, 300 - 120 * t]
+    strands = [one, across] if other else [one]
+    crossing = int(np.argmin(np.linalg.norm(one[:, None] - across, axis=2).min(axis=1)))
+    found = look_at(strands, one[crossing - round(away_px * 500 / 365)], rig)
+    assert found.is_seed_shared == is_shared
+    assert any("the seed lies on another strand" in why for why in found.reasons) == is_shared
+    assert (found.confidence < 0.5) == is_shared
+
+
+def test_a_seed_where_a_thread_crosses_itself_means_it(rig: StereoRig) -> None:
+    left, right = rig.project(figure_eight())
+    field = field_of(draw(left, rig), draw(right, rig), rig)
+    found = initialize(field, rig, Seed(pixel=tuple(left[1500])))
+    assert not found.is_seed_shared
+
+
 @pytest.mark.parametrize("is_joined", [True, False])
 def test_a_thread_that_may_have_run_into_another_one_is_doubtful(
     rig: StereoRig, is_joined: bool

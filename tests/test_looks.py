@@ -422,8 +422,10 @@ def test_a_curve_that_lacks_an_end_is_what_a_look_finds(rig: StereoRig) -> None:
         (shorter, whole, False),
     ):
         sureness = Sureness(replace(look, confidence=0.3), followed, 0, rig)
-        takes_place = sureness.weigh(replace(look, curve=found, confidence=0.6), followed)
-        assert (sureness.is_sure, takes_place) == (is_sure, True)
+        later = replace(look, curve=found, confidence=0.6)
+        assert sureness.weigh(later, followed)
+        assert not sureness.weigh(later, found)
+        assert sureness.is_sure == is_sure
 
 
 @pytest.mark.parametrize("is_clear_once", [True, False])
@@ -431,7 +433,7 @@ def test_places_that_are_clear_in_one_look_each_are_sure_together(
     rig: StereoRig, is_clear_once: bool
 ) -> None:
     near, far = (0.3, 0.4), (0.7, 0.4)
-    seen = [(near, far), (near,), (far,)] if is_clear_once else 3 * [(near, far)]
+    seen = [(near, far), *2 * [(near,), (far,)]] if is_clear_once else 5 * [(near, far)]
     looks = []
     for turn, left in enumerate(seen):
         truth = thread(0.6 * turn)
@@ -449,34 +451,30 @@ def test_places_that_are_clear_in_one_look_each_are_sure_together(
     assert not sureness.is_sure
 
 
-@pytest.mark.parametrize(
-    ("as_long", "likely", "is_sure"), [(True, 0.4, True), (False, 0.4, False), (True, 0.3, False)]
-)
-def test_looks_settle_doubts_about_a_curve_of_one_length_that_one_finds_likely(
-    rig: StereoRig, as_long: bool, likely: float, is_sure: bool
-) -> None:
+@pytest.mark.parametrize("as_long", [True, False])
+def test_looks_settle_doubts_about_a_curve_of_one_length(rig: StereoRig, as_long: bool) -> None:
     """An end beside another ridge, as one look sees it, is a crossing once the curve runs on there."""
-    part = 1.0 if as_long else 0.9
-    sureness: Sureness | None = None
-    for turn, (left, length) in enumerate([(((0.4, likely),), part), (((0.9, likely),), 1.0)]):
-        found = look_at(rig, thread(0.6 * turn), likely)
-        curve = nurbs.part(found.curve, 0.0, length)
-        found = replace(found, curve=curve, doubts=(left, ()))
-        sureness = sureness or Sureness(found, curve, 0, rig)
-        assert not sureness.is_sure
-        sureness.weigh(found, curve)
-    assert sureness is not None
-    assert sureness.is_sure == is_sure
+    first, second = (
+        replace(look_at(rig, thread(0.6 * turn), 0.6), doubts=(((place, 0.4),), ()))
+        for turn, place in enumerate((0.4, 0.9))
+    )
+    if not as_long:
+        first = replace(first, curve=nurbs.part(first.curve, 0.0, 0.9))
+    sureness = Sureness(first, first.curve, 0, rig)
+    sureness.weigh(second, second.curve)
+    assert sureness.is_sure == as_long
 
 
 @pytest.mark.parametrize(("confidence", "is_sure"), [(0.08, True), (0.03, False)])
 def test_a_hopeless_look_settles_no_doubts(
     rig: StereoRig, confidence: float, is_sure: bool
 ) -> None:
-    first = replace(look_at(rig, thread(0.0), 0.45), doubts=(((0.9, 0.5),), ()))
-    second = replace(look_at(rig, thread(0.6), confidence), doubts=(((0.4, 0.5),), ()))
+    first, second, third = (look_at(rig, thread(0.6 * turn), 0.6) for turn in range(3))
+    first, third = (replace(look, doubts=(((0.9, 0.4),), ())) for look in (first, third))
     sureness = Sureness(first, first.curve, 0, rig)
-    assert not sureness.weigh(second, second.curve)
+    for look in (replace(second, confidence=confidence), third):
+        assert not sureness.is_sure
+        assert not sureness.weigh(look, look.curve)
     assert sureness.is_sure == is_sure
 
 
@@ -484,7 +482,7 @@ def test_a_hopeless_look_settles_no_doubts(
 def test_a_doubt_that_stays_is_not_voted_down(rig: StereoRig, stays: bool) -> None:
     looks = [look_at(rig, thread(0.6 * turn), 0.4) for turn in range(8)]
     if stays:
-        looks = [replace(look, doubts=(((0.9, 0.5),), ())) for look in looks]
+        looks = [replace(look, doubts=(((0.9, 0.4),), ())) for look in looks]
     sureness = Sureness(looks[0], looks[0].curve, 0, rig)
     for look in looks[1:]:
         assert not sureness.weigh(look, look.curve)
@@ -519,6 +517,18 @@ def test_a_first_look_that_is_not_plain_needs_a_second_one(
     assert sureness.is_sure
 
 
+@pytest.mark.parametrize(("confidence", "is_enough"), [(0.8, False), (0.95, True)])
+def test_a_look_after_doubtful_ones_needs_another_unless_it_is_plain(
+    rig: StereoRig, confidence: float, is_enough: bool
+) -> None:
+    first, second, third = (look_at(rig, thread(0.6 * turn), confidence) for turn in range(3))
+    sureness = Sureness(replace(first, confidence=0.2), first.curve, 0, rig)
+    sureness.weigh(second, second.curve)
+    assert sureness.is_sure == is_enough
+    sureness.weigh(third, third.curve)
+    assert sureness.is_sure
+
+
 @pytest.mark.parametrize("is_accused", [False, True])
 def test_what_runs_beside_a_revoked_curve_takes_its_place(rig: StereoRig, is_accused: bool) -> None:
     first = look_at(rig, thread(0.0), 0.9 if is_accused else 0.1)
@@ -528,6 +538,23 @@ def test_what_runs_beside_a_revoked_curve_takes_its_place(rig: StereoRig, is_acc
     beside = look_at(rig, thread(0.6) + np.array([0.0, 2.0, 0.0]), 0.4)
     assert sureness.weigh(beside, followed) == is_accused
     assert not sureness.is_sure
+
+
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_a_seed_that_may_mean_either_thread_makes_none_sure(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, is_shared: bool
+) -> None:
+    def look(field: RidgeField, rig: StereoRig, *args: object) -> Initialization:
+        found = initialize(field, rig, *args)  # type: ignore[arg-type]
+        is_first = field.stamp.frame == 0
+        confidence = 0.3 if is_first else 1.0
+        return replace(found, confidence=confidence, is_seed_shared=is_shared and is_first)
+
+    looks_by(monkeypatch, look)
+    states = follow(rig, [thread(i / FPS) for i in range(2 * FPS)], range(0))
+    assert rms(states[-1], thread(2 - 1 / FPS)) < 0.15
+    assert any("found for sure" in state.events for state in states) != is_shared
+    assert states[-1].status is (Status.OCCLUDED if is_shared else Status.TRACKING)
 
 
 def test_a_revoked_curve_does_not_tell_the_length(

@@ -11,10 +11,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.doubts import FADES, Doubt, doubts
-from suturetrack.initialization.joints import inward
+from suturetrack.initialization.joints import Joints, inward
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
-from suturetrack.metrics import arc_lengths, nearest_index, resample
+from suturetrack.metrics import arc_lengths, nearest_index, polyline_distances, resample
 from suturetrack.types import Float64
 
 _FAINT = 0.4
@@ -27,6 +27,11 @@ _FAINTER = 0.49
 """What such an end leaves of the confidence."""
 _SHORTEST_TAIL = 24
 """Points that go on so, at least: what is shorter may be the thread's own end, in the shade."""
+_AS_CLEAR = 0.6
+"""Strength of another strand, against the thread's, from which it might be meant as well."""
+_MEETS_PX, _BRIDGED_PX, _LEAVES_PX = 5.0, 12.0, 15.0
+"""By how much farther from a seed than the thread it may run there, how far from there its segments end
+at most, and how far away from the thread it leads, at least."""
 _WINDOW, _STEP_POINTS = 10, 3
 """Points whose strength counts on each side of an end, and those about it that do not."""
 
@@ -47,6 +52,8 @@ class Thread:
 
     ridges: Ridges
     """Of the view; segments that two strands share are doubled."""
+    joints: Joints
+    """Of all segments."""
     entries: list[int]
     """The end at which each segment is entered: 2i is the start of segment i, 2i + 1 its end."""
     origin: int
@@ -61,11 +68,32 @@ class Thread:
     @property
     def others(self) -> Float64:
         """(k, 2) pixels on the ridges of other strands, as clear as the thread's or shared with it."""
-        ridges, own = self.ridges, {e // 2 for e in self.entries}
-        level = _FAINT * float(np.median(ridges.sample(self.chain.pixels)))
-        rest = [s for k, s in enumerate(ridges.segments) if k not in own]
-        clear = [s for s in rest if np.median(ridges.sample(s)) > level]
-        return np.concatenate([np.empty((0, 2)), *clear])
+        segments = self.ridges.segments
+        return np.concatenate([np.empty((0, 2)), *(segments[k] for k in self._others(_FAINT))])
+
+    def meets_another_at(self, place: Float64) -> bool:
+        """Whether another strand that leads away runs as near by a pixel (2,) as the thread itself."""
+        pixels, segments = self.chain.pixels, self.ridges.segments
+        reach = np.linalg.norm(pixels - place, axis=1).min() + _MEETS_PX
+        for k in self._others(_AS_CLEAR):
+            if np.linalg.norm(segments[k] - place, axis=1).min() > reach + _BRIDGED_PX:
+                continue
+            entries = self.joints.follow(k)
+            strand = _join([inward(segments, entry) for entry in entries])
+            is_near = np.linalg.norm(strand - place, axis=1).min() < reach
+            if is_near and polyline_distances(strand, pixels).max() > _LEAVES_PX:
+                return True
+        return False
+
+    def _others(self, strength: float) -> list[int]:
+        """The segments that are no part of the thread, and have that share of its strength."""
+        own, ridges = {e // 2 for e in self.entries}, self.ridges
+        level = strength * float(np.median(ridges.sample(self.chain.pixels)))
+        return [
+            k
+            for k, segment in enumerate(ridges.segments)
+            if k not in own and np.median(ridges.sample(segment)) > level
+        ]
 
 
 def follow_thread(
@@ -77,7 +105,7 @@ def follow_thread(
     entries = _without_faint_ends(ridges, joints.follow(origin), origin)
     line = _join([inward(ridges.segments, entry) for entry in entries])
     chain = Chain(line, tuple(doubts(joints, entries, ridges)))
-    return Thread(ridges, entries, origin, chain)
+    return Thread(ridges, joints, entries, origin, chain)
 
 
 def without_faint_tails(thread: Thread, place: Float64) -> Thread:

@@ -13,19 +13,15 @@ from suturetrack.types import Float64, Nurbs
 
 SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
-# Votes for a curve without doubts that make it sure, in those of a look that is just sure by itself.
-_ENOUGH = 1.5
-# What the likeliest of the looks has to be for that.
-_LIKELY = 0.35
-# And those that the look by which another curve was voted down has to have more.
-_PLENTY = 3.0
-# Confidence of the first look that needs no second one.
-_AT_ONCE = 0.75
+# And that of one that needs no other: the first one, and one after looks that were in doubt.
+_AT_ONCE, _SINGLE = 0.75, 0.9
+# Votes that make a curve sure, if no doubt stays: all but those of two sure looks.
+_ENOUGH = 1.75
 # Votes below which a curve is not worth looking from, and a look settles no doubts.
 _HOPELESS = 0.01
-# What the doubts that no look has settled leave of a curve that is sure, and how far apart two doubts
-# about one place are, along curves that differ in length by no more.
-_TOGETHER, _SAME_PLACE, _SAME_LENGTH = 0.6, 0.12, 0.025
+# How far apart two doubts about one place are, and by how much the lengths of what is one curve differ: the
+# thread keeps its length as it moves, and what it makes up with another one does not.
+_SAME_PLACE, _SAME_LENGTH = 0.12, 0.01
 # Two looks see the same if they are nowhere further apart, and another thing if they are somewhere.
 _SAME_PX, _OTHER_PX = 5.0, 15.0
 # How much the thread has to bend between two looks that both count.
@@ -44,10 +40,11 @@ class Sureness:
     """What the looks at a thread say together.
 
     A look votes for the curve that is followed if it finds the same one, from end to end in the same
-    order but for what the curve may lack at an end, and against it if it finds another; the square of
-    its confidence is its weight. What is voted down gives way to what the last look found. A look at
-    the same picture says nothing new: it counts only if the thread has bent since the last one that
-    did, or if it is sure by itself.
+    order but for what the curve may lack at an end, and against it if it finds another. A sure look has
+    one vote, any other the square of its confidence against that. What is voted down gives way to what
+    the last look found, and so does, with its votes, what had another length. A look at the same picture
+    says nothing new: it counts only if the thread has bent since the last one that did, or if it is sure
+    by itself.
 
     A place that one look doubts may be clear in another one that finds the same: of each doubt of the
     first look only the least is left that any has there. No votes outweigh one that stays.
@@ -61,6 +58,7 @@ class Sureness:
         now_ns: capture time of the field.
         rig: the cameras.
         before: how sure it was of what was followed before.
+        is_known: whether it has the length of a thread that was sure.
     """
 
     def __init__(
@@ -70,17 +68,15 @@ class Sureness:
         now_ns: int,
         rig: StereoRig,
         before: Sureness | None = None,
+        *,
+        is_known: bool = False,
     ) -> None:
-        self._rig, self._votes = rig, _votes(found.confidence)
-        self.confidence = found.confidence
-        """The best of a look that found what is followed."""
+        self._rig = rig
+        self._begin(found, _votes(found.confidence))
         self._accused: Float64 | None = None if before is None else before._accused
-        enough = _AT_ONCE if before is None else SURE
+        enough = SURE if is_known else _AT_ONCE
         self.is_sure = found.confidence >= enough and not self._is_accused(curve)
         """Whether the curve that is followed may be called the thread."""
-        self._evidence, self._length = 0.0, 0.0
-        self._doubts: PlacedDoubts | None = None
-        self._settle(found)
         self._shape = self._outline(curve)
         self._looks, self._last_ns = 0, now_ns
 
@@ -104,37 +100,32 @@ class Sureness:
         if self.is_sure:
             self._accused = self._outline(curve)
             self.is_sure, self._votes = False, _HOPELESS
-            self._doubts = None
+            self._length = 0.0
             self._looks, self._last_ns = 0, now_ns
 
     def weigh(self, found: Initialization, followed: Nurbs) -> bool:
         """Adds a look; whether what it found, in the direction of what is followed, takes its place."""
-        confidence = found.confidence
-        places = self._outline(found.curve), self._outline(followed)
+        is_sure, votes = found.confidence >= SURE, _votes(found.confidence)
         apart = self._away(found.curve, followed)
         agrees = apart < _SAME_PX or self.is_same(found.curve, followed)
         if agrees and self._is_accused(followed):
             return False
-        if confidence >= SURE and (agrees or apart < _OTHER_PX):
-            self.is_sure, self.confidence = True, max(self.confidence, confidence)
-            return apart >= _SAME_PX
-        if confidence < SURE and not self._has_bent(followed):
+        if not is_sure and (votes < _HOPELESS or not self._has_bent(followed)):
             return False
-        is_open = self._accused is None or self.is_sure
-        if not agrees and apart < _OTHER_PX and is_open:
-            return False
-        self._votes += _votes(confidence) if agrees else -_votes(confidence)
+        if not agrees and apart < _OTHER_PX:
+            agrees = is_sure
+            if not is_sure and (self._accused is None or self.is_sure):
+                return False
+        if agrees:
+            self._agree(found, votes)
+            self._shape = self._outline(followed)
+            return is_sure and apart >= _SAME_PX
+        self._votes -= votes
         is_outvoted = self._votes < 0
-        self.is_sure = -self._votes >= _PLENTY
-        self._votes, self._shape = abs(self._votes), places[0 if is_outvoted else 1]
         if is_outvoted:
-            self._doubts, self.confidence = None, confidence
-            self._settle(found)
-        elif agrees and _votes(confidence) >= _HOPELESS:
-            self.confidence = max(self.confidence, confidence)
-            left = self._settle(found)
-            together = max(self._evidence, self._votes >= _ENOUGH) * left
-            self.is_sure = together >= _TOGETHER and self.confidence >= _LIKELY
+            self._begin(found, -self._votes)
+        self.is_sure = is_outvoted and found.confidence >= _SINGLE
+        self._shape = self._outline(found.curve if is_outvoted else followed)
         return is_outvoted
 
     def outweighs(self, confidence: float, found: Nurbs, followed: Nurbs, *, likely: float) -> bool:
@@ -148,17 +139,23 @@ class Sureness:
         both = zip(self._lines(found), self._lines(followed), strict=True)
         return max(_apart(whole, part) for whole, part in both) < _SAME_PX
 
-    def _settle(self, found: Initialization) -> float:
-        """Keeps the doubts that this look shares; what they leave of the confidence.
+    def _begin(self, found: Initialization, votes: float) -> None:
+        """With what speaks for another curve."""
+        self._votes = votes
+        self.confidence = found.confidence
+        """The best of a look that found what is followed."""
+        self._doubts, self._length = found.doubts, length_of(found.curve)
 
-        Along a curve of another length the places are others: all doubts are new.
-        """
-        length, evidence, doubts = length_of(found.curve), _evidence(found), found.doubts
-        if self._doubts is not None and abs(length - self._length) < _SAME_LENGTH * self._length:
-            length, evidence = self._length, max(self._evidence, evidence)
-            doubts = _lessened(self._doubts, doubts)
-        self._evidence, self._doubts, self._length = evidence, doubts, length
-        return remaining(doubts)
+    def _agree(self, found: Initialization, votes: float) -> None:
+        """With a look at what is followed: its votes, and the doubts that it shares."""
+        if abs(length_of(found.curve) - self._length) > _SAME_LENGTH * self._length:
+            self._begin(found, votes)
+        else:
+            self._votes += votes
+            self.confidence = max(self.confidence, found.confidence)
+            self._doubts = _lessened(self._doubts, found.doubts)
+        is_enough = self._votes >= _ENOUGH and remaining(self._doubts) >= SURE
+        self.is_sure = is_enough or found.confidence >= _SINGLE
 
     def _is_accused(self, curve: Nurbs) -> bool:
         """Whether it is a curve that was revoked, and has not moved."""
@@ -203,11 +200,6 @@ def _apart(whole: Float64, part: Float64) -> float:
     return float(np.linalg.norm(there - resample(part, _PLACES), axis=1).max())
 
 
-def _evidence(found: Initialization) -> float:
-    """The confidence in a look before its doubts."""
-    return min(found.confidence / max(remaining(found.doubts), 1e-9), 1.0)
-
-
 def _lessened(doubts: PlacedDoubts, later: PlacedDoubts) -> PlacedDoubts:
     """What is left of doubts once another look at the same curve has had its own."""
     left, right = (
@@ -221,4 +213,4 @@ def _lessened(doubts: PlacedDoubts, later: PlacedDoubts) -> PlacedDoubts:
 
 
 def _votes(confidence: float) -> float:
-    return (confidence / SURE) ** 2
+    return min((confidence / SURE) ** 2, 1.0)

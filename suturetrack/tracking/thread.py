@@ -73,6 +73,8 @@ class Thread:
         """Length of a curve that was found with some hope, at most."""
         self._seeded_at = 0.5
         """Parameter of the curve at which it was found."""
+        self._is_seed_shared = False
+        """Whether another thread may be meant: no look can tell."""
         self._fields_to_rest = self._attempts = self._looks_in_vain = 0
 
     @property
@@ -262,6 +264,7 @@ class Thread:
             return
         assert outcome.found is not None
         self._seeded_at = _nearest(outcome.found.curve, self._seed, self._setup.rig)
+        self._is_seed_shared = outcome.found.is_seed_shared
         self._hold(outcome, "found")
 
     def _take_again(self, outcome: Outcome, known_lengths: tuple[float, ...]) -> None:
@@ -279,8 +282,9 @@ class Thread:
         is_whole = has_length(outcome.state.curve, known_lengths)
         is_whole &= not self._is_stub(outcome.state)
         if is_worse and is_whole and outcome.state.status is Status.TRACKING:
-            is_known = self._was_followed_for_sure(outcome.state.curve)
-            self._hold(outcome, "found again", self._sureness if is_known else None)
+            is_same = self._was_followed_for_sure(outcome.state.curve)
+            before = self._sureness if is_same else None
+            self._hold(outcome, "found again", before, is_known=bool(known_lengths))
 
     def _was_followed_for_sure(self, found: Nurbs) -> bool:
         """Whether it is what was followed for sure before it was lost, and beside the search."""
@@ -304,19 +308,26 @@ class Thread:
         if self._puts_right(found, outcome.state):
             self._hold(outcome, "put right", self._sureness)
             return
-        may_be_unsure = bool(search.before) or not self._was_sure
-        if self._is_sure or not (may_be_unsure or found.confidence >= SURE):
+        was_sure, may_be_unsure = self._is_sure, bool(search.before) or not self._was_sure
+        if was_sure or not (may_be_unsure or found.confidence >= SURE):
             return
         if self._sureness.weigh(found, search.followed):
             self._seeded_at = _nearest(found.curve, search.seed, self._setup.rig)
-            event = "found for sure" if self._sureness.is_sure else "found elsewhere"
+            event = "found for sure" if self._is_sure else "found elsewhere"
             self._hold(outcome, event, self._sureness)
-        elif self._sureness.is_sure:
+        elif self._is_sure:
             self._come_to(
                 replace(self._followed, events=("found for sure", *self._followed.events))
             )
 
-    def _hold(self, outcome: Outcome, event: str, sureness: Sureness | None = None) -> None:
+    def _hold(
+        self,
+        outcome: Outcome,
+        event: str,
+        sureness: Sureness | None = None,
+        *,
+        is_known: bool = False,
+    ) -> None:
         assert outcome.pursuit is not None
         assert outcome.state is not None
         self._pursuit, state = outcome.pursuit, outcome.state
@@ -327,6 +338,7 @@ class Thread:
             state.stamp.capture_ns,
             self._setup.rig,
             self._sureness,
+            is_known=is_known,
         )
         self._fields_to_rest = self._attempts = 0
         if not self._sureness.is_hopeless:
@@ -355,7 +367,9 @@ class Thread:
 
     @property
     def _is_sure(self) -> bool:
-        return self._sureness is not None and self._sureness.is_sure
+        if self._sureness is None or self._is_seed_shared:
+            return False
+        return self._sureness.is_sure
 
 
 def _nearest(curve: Nurbs, seed: Seed, rig: StereoRig) -> float:
