@@ -810,6 +810,29 @@ def test_a_thread_that_is_tracked_takes_no_other_name(rig: StereoRig) -> None:
     assert all(step.states[0].status is Status.TRACKING for step in steps)
 
 
+def test_a_closer_look_does_not_take_a_thread_that_is_tracked(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However sure it is of that one."""
+    seeds = [seed_on(rig, points, name) for name, points in zip("ab", pair(0), strict=True)]
+
+    def look(field: RidgeField, rig: StereoRig, seed: Seed, _: object) -> Initialization:
+        is_first = seed.pixel is not None
+        which = 0 if seed.thread == "a" or not is_first else 1
+        found = initialize(field, rig, seed_on(rig, pair(field.stamp.frame)[which]))
+        return replace(found, confidence=1.0 if not is_first else (0.1, 0.8)[seed.thread == "a"])
+
+    looks_by(monkeypatch, look)
+    tracker = Tracker(rig)
+    for seed in seeds:
+        tracker.seed(seed)
+    for field in fields_of(rig, 2 * FPS, range(0)):
+        states = {state.thread: state for state in tracker.step(field).states}
+    for name, points, status in zip("ab", pair(2 * FPS - 1), ("TRACKING", "OCCLUDED"), strict=True):
+        assert states[name].status is Status[status]
+        assert rms(states[name], points) < 0.2
+
+
 @pytest.mark.parametrize("away_px", [6, 15])
 def test_a_thread_is_seeded_near_where_it_crosses_a_tracked_one(
     rig: StereoRig, away_px: int

@@ -127,7 +127,9 @@ class Closer:
 
 def _none_of(others: Neighbours, found: Initialization, rig: StereoRig) -> Initialization | None:
     surer = others.as_sure_as(found.confidence)
-    return None if lies_on(found.curve, surer, rig) else doubting_ends(found, others, rig)
+    if known_as(found, others, rig) or lies_on(found.curve, surer, rig):
+        return None
+    return doubting_ends(found, others, rig)
 
 
 Search = FromSeed | Again | Closer
