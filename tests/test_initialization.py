@@ -36,7 +36,13 @@ from tests.painting import paint
 STAMP = Stamp(0, 0, 0)
 
 
-def draw(pixels: Float64, rig: StereoRig, image: Image | None = None, width: int = 3) -> Image:
+def draw(
+    pixels: Float64,
+    rig: StereoRig,
+    image: Image | None = None,
+    width: int = 3,
+    grey: int = 70,
+) -> Image:
     """A dark thread through (k, 2) pixels, drawn four times as large and reduced."""
     scale = 4
     columns, rows = rig.image_size
@@ -46,7 +52,7 @@ def draw(pixels: Float64, rig: StereoRig, image: Image | None = None, width: int
     at = np.round(((pixels + 0.5) * scale - 0.5) * 16).astype(np.int32)
     cv2.polylines(large, [at], False, 255, width * scale * 3 // 4, cv2.LINE_AA, 4)
     share = cv2.resize(large, (columns, rows), interpolation=cv2.INTER_AREA) / 255
-    return np.rint(image * (1 - share) + 70 * share).astype(np.uint8)
+    return np.rint(image * (1 - share) + grey * share).astype(np.uint8)
 
 
 def field_of(left: Image, right: Image, rig: StereoRig) -> RidgeField:
@@ -444,6 +450,22 @@ def test_a_thread_that_may_have_run_into_another_one_is_doubtful(
     found = look_at(strands, straight[370], rig)
     assert (found.confidence < 0.5) == is_joined
     assert any("another strand that ends on it" in why for why in found.reasons) == is_joined
+
+
+@pytest.mark.parametrize(("grey", "is_thread"), [(120, True), (175, False)])
+def test_a_thread_may_have_run_into_one_of_another_colour_but_into_no_shadow(
+    rig: StereoRig, grey: int, is_thread: bool
+) -> None:
+    t = np.linspace(0, 1, 500)
+    straight = np.c_[np.full(500, 330.0), 60 + 360 * t]
+    aside = np.c_[335 + 80 * t**1.5, 250 - 150 * t]
+    views = [
+        draw(aside - shift, rig, draw(straight - shift, rig), grey=grey)
+        for shift in (np.zeros(2), np.array([110.0, 0.0]))
+    ]
+    found = initialize(field_of(views[0], views[1], rig), rig, Seed(pixel=(330.0, 120.0)))
+    assert (found.confidence < 0.5) == is_thread
+    assert any("another strand that ends on it" in why for why in found.reasons) == is_thread
 
 
 @pytest.mark.parametrize("is_bent", [True, False])

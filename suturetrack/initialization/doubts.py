@@ -44,9 +44,11 @@ _SEPARATE_PX = 4.2
 """Distance from which an end beside the thread itself is seen to end: nearer ones run into it."""
 _PARALLEL = 0.7
 """Cosine of the angle up to which a strand that ends on the thread runs into it."""
-_CLEAR, _LEAVES_PX = 0.6, 15.0
+_JOINS_PX = 8.0
+"""How near to it such a strand ends: the thread draws its last points aside."""
+_CLEAR, _LEAVES_PX = 0.4, 15.0
 """Strength of such a strand, against the thread's on the weaker side, and how far it comes from, at
-least."""
+least: another thread may have another colour, and a shadow has a quarter of the strength."""
 _SIDE = 40
 """Points of the thread on each side of a place whose strength counts there."""
 
@@ -111,7 +113,7 @@ def _lead(joints: Joints, entry: int, entries: list[int], within: dict[int, list
 
 
 def _joining(joints: Joints, entries: list[int], ridges: Ridges) -> list[int]:
-    """The free ends of other strands, as clear as the thread, that run into its side."""
+    """The free ends of other strands, clear enough for threads, that run into its side."""
     own = [inward(joints.segments, e) for e in entries]
     line, tangents = np.concatenate(own), np.concatenate([chain_tangents(s) for s in own])
     strength, tree = ridges.sample(line), cKDTree(line)
@@ -121,7 +123,7 @@ def _joining(joints: Joints, entries: list[int], ridges: Ridges) -> list[int]:
         arm = segment[:ARM]
         distance, at = tree.query(arm[0])
         heading = chain_tangents(arm)[len(arm) // 2]
-        if distance > TOUCHING_PX or abs(float(heading @ tangents[at])) < _PARALLEL:
+        if distance > _JOINS_PX or abs(float(heading @ tangents[at])) < _PARALLEL:
             continue
         strand = [joints.segments[e // 2] for e in joints.follow(end // 2)]
         if np.max(tree.query(np.concatenate(strand))[0]) < _LEAVES_PX:  # The rim of a highlight.
