@@ -452,6 +452,19 @@ def test_a_thread_that_may_have_run_into_another_one_is_doubtful(
     assert any("another strand that ends on it" in why for why in found.reasons) == is_joined
 
 
+@pytest.mark.parametrize(("part_px", "is_doubtful"), [(12, True), (60, False)])
+def test_a_part_that_is_shorter_than_the_gap_before_it_may_be_something_else(
+    rig: StereoRig, part_px: int, is_doubtful: bool
+) -> None:
+    t = np.linspace(0, 1, 500)[:, None]
+    thread = [330.0, 100.0] + t * [0.0, 200.0]
+    beyond = [330.0, 322.0] + t * [0.0, part_px]
+    found = look_at([thread, beyond], thread[200], rig)
+    assert rig.project(dense(found.curve))[0][:, 1].max() > 325
+    assert any("beyond a gap" in why for why in found.reasons) == is_doubtful
+    assert (found.confidence < 0.5) == is_doubtful
+
+
 @pytest.mark.parametrize(("grey", "is_thread"), [(120, True), (175, False)])
 def test_a_thread_may_have_run_into_one_of_another_colour_but_into_no_shadow(
     rig: StereoRig, grey: int, is_thread: bool

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.doubts import (
+    BEYOND,
     CROSSING,
     FADES,
     FOREIGN,
@@ -143,7 +144,7 @@ def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
     for doubt in doubts:
         near = np.flatnonzero(np.linalg.norm(line - doubt.place, axis=1) <= _SAME_PLACE_PX)
         if (
-            doubt.why in (*FOREIGN, HIDDEN)
+            doubt.why in (*FOREIGN, BEYOND, HIDDEN)
             or not _is_one_pass(line, near)
             or not _is_all_ridge(doubt.place, line, near, ridges)
         ):
@@ -172,7 +173,7 @@ def _placed(
         both = max(rest, min(_same(why, there, doubts[1 - view]), default=1.0))
         if why == SHARED or not _is_shared(place, line, counterpart, chains[1 - view].pixels):
             left = rest
-        elif why in (CROSSING, FADES, *FOREIGN) and both < _GRAVE:
+        elif why in (BEYOND, CROSSING, FADES, *FOREIGN) and both < _GRAVE:
             left = both
         else:
             left = float(np.sqrt(rest))
@@ -250,7 +251,7 @@ def _is_near(where: Float64, places: Float64) -> bool:
 
 def _distinct(chain: Chain) -> list[Doubt]:
     """The doubts, the gravest first, one of a kind for each place: about other threads, about stretches that
-    strands share, and all the rest."""
+    strands share, about parts beyond gaps, and all the rest."""
     kept: list[Doubt] = []
     for doubt in sorted(chain.doubts, key=lambda d: d.rest):
         alike = [d.place for d in kept if _kind(d.why) == _kind(doubt.why)]
@@ -260,7 +261,9 @@ def _distinct(chain: Chain) -> list[Doubt]:
 
 
 def _kind(why: str) -> str:
-    return FOREIGN[0] if why in FOREIGN else SHARED if why == SHARED else CROSSING
+    if why in FOREIGN:
+        return FOREIGN[0]
+    return why if why in (BEYOND, SHARED) else CROSSING
 
 
 def _agreement(pixels: Float64, chain: Float64, rig: StereoRig) -> float:

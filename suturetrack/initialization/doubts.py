@@ -24,12 +24,19 @@ BENT = "a bend as of two strands"
 """Where the thread may end, and another one go on from there."""
 SHARP = "a sharp bend"
 FADES = "a fainter ridge behind an end"
+BEYOND = "a part beyond a gap that is longer"
+"""Something else may lie where the thread would go on: of 208 threads found right none had such a part in
+both views."""
 HIDDEN = "a hidden stretch"
 """What is seen on both sides of it may be two threads."""
 FOREIGN = JOINED, BENT
 """Whether a part is another thread's: what one view shows as the one, the other may as the other."""
 _FOREIGN = 0.45
 """What such a doubt leaves of the confidence."""
+_BEYOND = 0.45
+"""What such a part leaves of it."""
+_UNSEEN = 0.3
+"""Strength in the gap, against the part's, at most."""
 _HIDDEN = 0.7
 """What a hidden stretch leaves of it."""
 _REASSURANCE = 0.3
@@ -143,7 +150,21 @@ def _at_tips(joints: Joints, entries: list[int], ridges: Ridges) -> list[tuple[i
             on = min((joints.price[tip, j] for j in within.get(tip, ())), default=np.inf)
             rest = 0.25 if on < _RUNS_ON else 0.4
             found.append((tip, "an end beside another ridge", rest))
+        if _is_beyond_gap(joints, tip, ridges):
+            found.append((tip, BEYOND, _BEYOND))
     return found
+
+
+def _is_beyond_gap(joints: Joints, tip: int, ridges: Ridges) -> bool:
+    """Whether the segment at a tip is shorter than a gap through which the thread leads there."""
+    segment, start = inward(joints.segments, tip), joints.partner.get(tip ^ 1)
+    if start is None:
+        return False
+    before, after = segment[-1], inward(joints.segments, start)[0]
+    gap = float(np.linalg.norm(after - before))
+    between = ridges.sample(np.linspace(before, after, _GAP_SAMPLES))
+    is_unseen = between.min() < _UNSEEN * np.median(ridges.sample(segment))
+    return bool(is_unseen and gap > TOUCHING_PX and len(segment) < gap)
 
 
 def _runs_into_another(joints: Joints, tip: int, entries: list[int], ridges: Ridges) -> bool:
