@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 from rich.console import Console
+from rich.markup import escape
 
 from services.calibration_check import (
     Epipolar,
@@ -76,7 +77,7 @@ def run(config: CalibrationConfig) -> None:
             failure = "the thread lies where only swapped cameras see it; swap left and right"
         warnings += more
     for warning in warnings:
-        console.print(f"[yellow]warning:[/] {warning}", soft_wrap=True, highlight=False)
+        console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True, highlight=False)
     if failure is not None:
         raise InputError(f"calibration {config.file} cannot be used: {failure}")
     if not warnings:

@@ -88,6 +88,9 @@ def load_hand_eye(path: Path) -> HandEye:
         ) from error
     if not isinstance(content, dict) or "camera_from_base" not in content:
         raise InputError(f"{where}: camera_from_base is missing, four rows of four numbers")
+    unknown = [str(name) for name in content if name not in ("camera_from_base", "tip")]
+    if unknown:
+        raise InputError(f"{where}: {', '.join(unknown)} is unknown; use camera_from_base and tip")
     matrix = numbers(content["camera_from_base"], (4, 4), "camera_from_base", where)
     tip = numbers(content.get("tip", (0, 0, 0)), (3,), "tip", where)
     if not np.allclose(matrix[3], [0, 0, 0, 1]):

@@ -107,6 +107,7 @@ def test_a_saved_rig_is_read_back(tmp_path: Path, rig: StereoRig) -> None:
         ({"K1": K.T.copy()}, "K1 is not a camera matrix"),
         ({"D2": np.zeros((1, 3))}, "D2 has 3 coefficients"),
         ({"ImageSize": np.array([[0.0, 480]])}, "ImageSize"),
+        ({"ImageSize": np.array([[640.5, 480.0]])}, r"ImageSize \[640.5, 480.0\] .* whole pixels"),
         ({"ImageSize": np.array([[9216.0, 480]])}, "16 to 8192 px"),
         ({"ImageSize": np.array([[100.0, 100.0]])}, "principal point"),
     ],

@@ -161,6 +161,7 @@ def test_the_tip_is_turned_into_the_rectified_view(distorted_rig: StereoRig) -> 
         ({"camera_from_base": BASE.T.tolist()}, "last row of camera_from_base must be 0 0 0 1"),
         ({"camera_from_base": np.diag([2.0, 1, 1, 1]).tolist()}, "no rotation"),
         ({"camera_from_base": np.diag([-1.0, 1, 1, 1]).tolist()}, "no rotation"),
+        ({"camera_from_base": np.eye(4).tolist(), "tipp": [0, 0, 0.1]}, "tipp is unknown"),
         ({"camera_from_base": np.eye(4).tolist(), "tip": [1, 2]}, "tip must be 3 numbers"),
         ({"camera_from_base": np.eye(4).tolist(), "tip": [0, 0, math.nan]}, "finite"),
         ({"camera_from_base": np.eye(4).tolist(), "tip": [0, 0, 120]}, "millimetres"),

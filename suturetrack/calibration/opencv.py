@@ -29,8 +29,10 @@ def read(path: Path, unit: str | None, where: str) -> StereoRig:
         fisheye = not model.empty() and model.string() == "equidistant"
     finally:
         storage.release()
-    if size.size != 2:
-        raise InputError(f"{where}: ImageSize {size.tolist()} must be [width, height] in pixels")
+    if size.size != 2 or (size != np.rint(size)).any():
+        raise InputError(
+            f"{where}: ImageSize {size.tolist()} must be [width, height] in whole pixels"
+        )
     left, right = (
         Lens(entries[k], entries[d].ravel(), fisheye, (k, d))
         for k, d in (("K1", "D1"), ("K2", "D2"))
