@@ -120,7 +120,8 @@ class Status(StrEnum):
     TRACKING = "tracking"
     """The curve is held and most of it is seen."""
     OCCLUDED = "occluded"
-    """Less than half of it is seen, a part may be elsewhere, or no look at it was sure as yet."""
+    """Less than half of it is seen, a part may be elsewhere, its length does not fit, no look at it was sure
+    as yet, or its seed lies on another strand as well."""
     LOST = "lost"
     """The thread is not where the curve says, or nobody can tell."""
 
