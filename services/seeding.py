@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -17,6 +18,9 @@ from suturetrack.tracking import Tracker
 from suturetrack.tracking.tracker import FORGOTTEN
 from suturetrack.types import InputError, Seed, Stamp
 
+log = logging.getLogger("suturetrack")
+_MOST_REASONS = 3
+"""Of what lowers the confidence in a thread, in a terminal."""
 _LONGEST_WAIT = 10
 """Fields: where the clocks of two machines disagree, a seed does not wait forever."""
 _ON_ITS_WAY_NS = 5_000_000
@@ -146,6 +150,8 @@ class SeedDesk:
                 continue
             if isinstance(result, Initialization):
                 _answer(case, self._found(thread, stamp, result))
+                if case.request is None:
+                    log.info("thread %s: %s", thread, self._outcome(result, _MOST_REASONS))
             else:
                 case.reason = result.reason
                 if self._tracker.is_sought(thread):
@@ -165,11 +171,16 @@ class SeedDesk:
             raise InputError(_failure(given[0]))
 
     def _found(self, thread: str, stamp: Stamp, found: Initialization) -> SeedReply:
-        metres = self._rig.metres_per_unit
-        length_mm = nurbs.length(found.curve) * metres * 1000
+        curve = scaled(found.curve, self._rig.metres_per_unit)
+        return SeedReply(thread, True, self._outcome(found), stamp, curve)
+
+    def _outcome(self, found: Initialization, most: int | None = None) -> str:
+        """In words, with so many reasons at most."""
+        length_mm = nurbs.length(found.curve) * self._rig.metres_per_unit * 1000
         outcome = f"found {length_mm:.1f} mm with confidence {found.confidence:.2f}"
-        reason = "; ".join((outcome, *found.reasons))
-        return SeedReply(thread, True, reason, stamp, scaled(found.curve, metres))
+        more = found.reasons[len(found.reasons[:most]) :]
+        rest = (f"and {len(more)} more",) if more else ()
+        return "; ".join((outcome, *found.reasons[:most], *rest))
 
     def _not_found(self, thread: str, stamp: Stamp, error: InitializationError) -> SeedReply:
         raw = self._rig.raw_pixels(error.candidates)

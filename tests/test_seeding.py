@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from services import topics
@@ -10,11 +11,13 @@ from services.memory_transport import Hub
 from services.seeding import SeedDesk
 from services.source import _is_worth_more
 from services.wire import scaled
+from suturetrack import nurbs
 from suturetrack.camera import StereoRig
+from suturetrack.initialization import Growth, Initialization, ViewGrowth
 from suturetrack.tracking import Tracker
 from suturetrack.tracking.thread import not_found
 from suturetrack.tracking.tracker import FORGOTTEN
-from suturetrack.types import InputError, Seed, Stamp
+from suturetrack.types import InputError, Nurbs, Seed, Stamp
 
 
 @pytest.mark.parametrize("again", [False, True])
@@ -53,4 +56,26 @@ def test_a_point_in_another_unit_than_metres_is_refused(
         f"the seed is {said} m away, but the cameras see from 0.0501 to 16 m; a point is in metres"
     )
     assert [*desk.seeds] == ["a"]
+    bus.close()
+
+
+def test_what_was_found_from_a_given_seed_is_said(
+    rig: StereoRig, curve: Nurbs, caplog: pytest.LogCaptureFixture
+) -> None:
+    bus = Bus(Hub().connect(), "rig", "tracker")
+    desk = SeedDesk(bus, Tracker(rig), rig)
+    nothing = ViewGrowth(np.zeros((1, 1), np.float32), (), np.empty((0, 2, 2)), ())
+    growth = Growth(nothing, nothing, np.empty((0, 2, 2)))
+    desk.seed(Seed("a", pixel=(320.0, 240.0)))
+    desk.seed(Seed("b", pixel=(320.0, 240.0)))
+    plain = Initialization(curve, 1.0, (), 0.1, growth)
+    doubtful = Initialization(curve, 0.25, tuple("vwxyz"), 0.1, growth)
+    with caplog.at_level("INFO", logger="suturetrack"):
+        desk.settle(Stamp(0, 0, 0), {"a": plain, "b": doubtful})
+    length = f"{nurbs.length(curve):.1f} mm"
+    assert [record.getMessage() for record in caplog.records] == [
+        f"thread a: found {length} with confidence 1.00",
+        f"thread b: found {length} with confidence 0.25; v; w; x; and 2 more",
+    ]
+    assert not desk.seeds
     bus.close()
