@@ -833,7 +833,7 @@ def test_a_closer_look_does_not_take_a_thread_that_is_tracked(
         assert rms(states[name], points) < 0.2
 
 
-@pytest.mark.parametrize("away_px", [6, 15])
+@pytest.mark.parametrize("away_px", [2, 6, 15])
 def test_a_thread_is_seeded_near_where_it_crosses_a_tracked_one(
     rig: StereoRig, away_px: int
 ) -> None:

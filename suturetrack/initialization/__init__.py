@@ -46,10 +46,6 @@ __all__ = [
 _SHORTEST_STEPS = 4
 _FAINT = 0.15
 """Share of the thread's response below which nothing is shown of its ends."""
-_MEANT = 0.3
-"""What is left of the confidence where the seed lies on another strand as well: of twelve such starts,
-among 141 in clutter, three were right."""
-_EITHER = "the seed lies on another strand as well; seed it where it runs alone"
 _LEAST_MATCH = 0.35
 """Median response of the right view, against the left one, below which it shows another scene."""
 
@@ -193,12 +189,9 @@ def _reconstruct(start: _Start, field: RidgeField) -> Initialization:
     confidence, reasons, doubts = judge(
         curve, samples, sigma, found.chains, ridges, shown, start.scale
     )
-    is_shared = found.left.meets_another_at(start.pixel)
-    if is_shared:
-        confidence *= _MEANT
-        reasons = (_EITHER, *reasons)
     distance = samples.distance_px
-    return Initialization(curve, confidence, reasons, distance, growth, doubts, is_shared, rows)
+    first = Initialization(curve, confidence, reasons, distance, growth, doubts, row_offset_px=rows)
+    return first.meaning(either=found.left.meets_another_at(start.pixel))
 
 
 def _first_curve(pixels: Float64, rig: StereoRig, config: InitializationConfig) -> Nurbs:

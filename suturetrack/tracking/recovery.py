@@ -15,7 +15,7 @@ from suturetrack.initialization import (
     initialize,
 )
 from suturetrack.kernels import search
-from suturetrack.metrics import polyline_length
+from suturetrack.metrics import polyline_distances, polyline_length
 from suturetrack.nurbs import evaluate, reversed_curve, tangents
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
@@ -34,6 +34,8 @@ _SAME = 0.9
 _EVENLY = np.linspace(0, 1, 4 * _PLACES)
 # How near and for how long an end may run along another thread, and what more leaves of the confidence.
 _BESIDE_PX, _LONGEST_PX, _DOUBTED = 5.0, 12.0, 0.3
+# How near to a seed a thread passes that runs along the other one there, for a while.
+_MEETS_PX = 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +118,15 @@ def known_as(found: Initialization, others: Neighbours, rig: StereoRig) -> str:
         if _shared(found.curve, other, rig, _BESIDE_PX).mean() > _SAME:
             return name
     return ""
+
+
+def means_no_other(found: Initialization, seed: Seed, others: Neighbours, rig: StereoRig) -> bool:
+    """Whether the seed lies on two strands, of which the one that was not found is tracked: it has a name."""
+    if not found.is_seed_shared:
+        return False
+    pixel = rig.locate(seed)[None]
+    tracked = [other.both[0].pixels for other in others.tracked.values()]
+    return any(polyline_distances(pixel, strand)[0] < _MEETS_PX for strand in tracked)
 
 
 def doubting_ends(found: Initialization, others: Neighbours, rig: StereoRig) -> Initialization:

@@ -18,6 +18,7 @@ from suturetrack.tracking.recovery import (
     find_again,
     known_as,
     lies_on,
+    means_no_other,
     starts_on,
 )
 from suturetrack.tracking.strands import Neighbours
@@ -50,6 +51,8 @@ class FromSeed:
         if name := known_as(found, others, rig):
             reason = f"that is thread {name} already"
             return InitializationError(reason, np.empty((0, 2)), found.growth)
+        if means_no_other(found, self.seed, others, rig):
+            found = found.meaning(either=False)
         return doubting_ends(found, others, rig)
 
     def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:

@@ -42,9 +42,9 @@ class Sureness:
     A look votes for the curve that is followed if it finds the same one, from end to end in the same
     order but for what the curve may lack at an end, and against it if it finds another. A sure look has
     one vote, any other the square of its confidence against that. What is voted down gives way to what
-    the last look found, and so does, with its votes, what had another length than a look that is not sure.
-    A look at the same picture says nothing new: it counts only if the thread has bent since the last one
-    that did, or if it is sure by itself.
+    the last look found. Looks that are not sure are added up only along one length: what has another one
+    counts instead, if it has more votes. A look at the same picture says nothing new: it counts only if the
+    thread has bent since the last one that did, or if it is sure by itself.
 
     A place that one look doubts may be clear in another one that finds the same: of each doubt of the
     first look only the least is left that any has there. No votes outweigh one that stays.
@@ -154,7 +154,7 @@ class Sureness:
             doubts = _lessened(self._doubts, found.doubts) if is_as_long else found.doubts
             self._votes, self._doubts, self._length = self._votes + votes, doubts, length
             self.confidence = max(self.confidence, found.confidence)
-        else:
+        elif votes > self._votes:
             self._begin(found, votes)
         is_enough = self._votes >= _ENOUGH and remaining(self._doubts) >= SURE
         self.is_sure = is_enough or found.confidence >= _SINGLE
