@@ -421,7 +421,7 @@ def test_a_curve_that_lacks_an_end_is_what_a_look_finds(rig: StereoRig) -> None:
         (whole, short, False),
         (shorter, whole, False),
     ):
-        sureness = Sureness(replace(look, confidence=0.3), followed, 0, rig)
+        sureness = Sureness(replace(look, confidence=0.4), followed, 0, rig)
         later = replace(look, curve=found, confidence=0.6)
         assert sureness.weigh(later, followed)
         assert not sureness.weigh(later, found)
@@ -433,7 +433,7 @@ def test_places_that_are_clear_in_one_look_each_are_sure_together(
     rig: StereoRig, is_clear_once: bool
 ) -> None:
     near, far = (0.3, 0.4), (0.7, 0.4)
-    seen = [(near, far), *2 * [(near,), (far,)]] if is_clear_once else 5 * [(near, far)]
+    seen = [(near, far), (near,), (far,), (near,)] if is_clear_once else 4 * [(near, far)]
     looks = []
     for turn, left in enumerate(seen):
         truth = thread(0.6 * turn)

@@ -15,13 +15,13 @@ SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
 # And that of one that needs no other: the first one, and one after looks that were in doubt.
 _AT_ONCE, _SINGLE = 0.75, 0.9
-# Votes that make a curve sure, if no doubt stays: all but those of two sure looks.
-_ENOUGH = 1.75
+# Votes that make a curve sure, if no doubt stays: of a sure look one, and half of one of others.
+_ENOUGH = 1.5
 # Votes below which a curve is not worth looking from, and a look settles no doubts.
 _HOPELESS = 0.01
 # How far apart two doubts about one place are, and by how much the lengths of what is one curve differ: the
 # thread keeps its length as it moves, and what it makes up with another one does not.
-_SAME_PLACE, _SAME_LENGTH = 0.12, 0.01
+_SAME_PLACE, _SAME_LENGTH = 0.12, 0.002
 # Two looks see the same if they are nowhere further apart, and another thing if they are somewhere.
 _SAME_PX, _OTHER_PX = 5.0, 15.0
 # How much the thread has to bend between two looks that both count.
@@ -42,9 +42,9 @@ class Sureness:
     A look votes for the curve that is followed if it finds the same one, from end to end in the same
     order but for what the curve may lack at an end, and against it if it finds another. A sure look has
     one vote, any other the square of its confidence against that. What is voted down gives way to what
-    the last look found. Looks that are not sure are added up only along one length: what has another one
-    counts instead, if it has more votes. A look at the same picture says nothing new: it counts only if the
-    thread has bent since the last one that did, or if it is sure by itself.
+    the last look found. Looks are added up along one length only, unless both are sure: what has another
+    one counts instead, if it has more votes. A look at the same picture says nothing new: it counts only
+    if the thread has bent since the last one that did, or if it is sure by itself.
 
     A place that one look doubts may be clear in another one that finds the same: of each doubt of the
     first look only the least is left that any has there. No votes outweigh one that stays.
@@ -150,7 +150,7 @@ class Sureness:
         """With a look at what is followed: its votes, and the doubts that it shares."""
         length = length_of(found.curve)
         is_as_long = abs(length - self._length) <= _SAME_LENGTH * self._length
-        if is_as_long or found.confidence >= SURE:
+        if is_as_long or min(found.confidence, self.confidence) >= SURE:
             doubts = _lessened(self._doubts, found.doubts) if is_as_long else found.doubts
             self._votes, self._doubts, self._length = self._votes + votes, doubts, length
             self.confidence = max(self.confidence, found.confidence)
