@@ -29,9 +29,12 @@ _SHORTEST_TAIL = 24
 """Points that go on so, at least: what is shorter may be the thread's own end, in the shade."""
 _AS_CLEAR = 0.6
 """Strength of another strand, against the thread's, from which it might be meant as well."""
-_MEETS_PX, _BRIDGED_PX, _LEAVES_PX = 5.0, 12.0, 15.0
-"""By how much farther from a seed than the thread it may run there, how far from there its segments end
-at most, and how far away from the thread it leads, at least."""
+_MEETS_PX, _BRIDGED_PX = 5.0, 12.0
+"""By how much farther from a seed than the thread it may run there, and how far from there its segments end
+at most."""
+_LEAVES_PX, _AROUND_PX = 6.0, 60.0
+"""How far away from the thread it leads, at least, and how far around the seed: what runs along the thread
+for longer is a part of it that was doubled."""
 _WINDOW, _STEP_POINTS = 10, 3
 """Points whose strength counts on each side of an end, and those about it that do not."""
 
@@ -80,8 +83,9 @@ class Thread:
                 continue
             entries = self.joints.follow(k)
             strand = _join([inward(segments, entry) for entry in entries])
-            is_near = np.linalg.norm(strand - place, axis=1).min() < reach
-            if is_near and polyline_distances(strand, pixels).max() > _LEAVES_PX:
+            away = np.linalg.norm(strand - place, axis=1)
+            around = strand[away < _AROUND_PX]
+            if away.min() < reach and polyline_distances(around, pixels).max() > _LEAVES_PX:
                 return True
         return False
 
