@@ -178,9 +178,9 @@ class SeedDesk:
         """In words, with so many reasons at most."""
         length_mm = nurbs.length(found.curve) * self._rig.metres_per_unit * 1000
         outcome = f"found {length_mm:.1f} mm with confidence {found.confidence:.2f}"
-        more = found.reasons[len(found.reasons[:most]) :]
-        rest = (f"and {len(more)} more",) if more else ()
-        return "; ".join((outcome, *found.reasons[:most], *rest))
+        said = found.reasons[:most]
+        unsaid = len(found.reasons) - len(said)
+        return "; ".join((outcome, *said, *([f"and {unsaid} more"] if unsaid else [])))
 
     def _not_found(self, thread: str, stamp: Stamp, error: InitializationError) -> SeedReply:
         raw = self._rig.raw_pixels(error.candidates)
