@@ -15,6 +15,7 @@ from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.segmentation import Segmenter
+from suturetrack.tracking.thread import FOUND, GIVEN_UP
 from suturetrack.types import InputError, Seed, Stamp, Status, StereoFrame, ThreadState
 
 _PERIOD_NS = 1_000_000_000
@@ -106,6 +107,8 @@ class Adaptation:
     def _take_in(self, state: ThreadState) -> None:
         self._arrived.append(state)
         self._latest[state.thread] = state.stamp
+        if FOUND in state.events or GIVEN_UP in state.events:
+            self._segmenter.settle(state.thread, is_found=FOUND in state.events)
         follow(self._segmenter, scaled(state, 1 / self._rig.metres_per_unit))
 
     def _learn_first(self, sample: StereoFrame, state: ThreadState) -> None:

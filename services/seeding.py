@@ -158,8 +158,10 @@ class SeedDesk:
                     continue
                 if case.request is None:
                     raise InputError(_failure(case))
-                self._bus.publish(topics.DROPPED, Forget(thread))
-                _answer(case, self._not_found(thread, stamp, result))
+                is_kept = self._tracker.is_known(thread)
+                if not is_kept:
+                    self._bus.publish(topics.DROPPED, Forget(thread))
+                _answer(case, self._not_found(thread, stamp, result, is_kept=is_kept))
             del self._cases[thread]
 
     def close(self) -> None:
@@ -182,10 +184,13 @@ class SeedDesk:
         unsaid = len(found.reasons) - len(said)
         return "; ".join((outcome, *said, *([f"and {unsaid} more"] if unsaid else [])))
 
-    def _not_found(self, thread: str, stamp: Stamp, error: InitializationError) -> SeedReply:
+    def _not_found(
+        self, thread: str, stamp: Stamp, error: InitializationError, *, is_kept: bool
+    ) -> SeedReply:
         raw = self._rig.raw_pixels(error.candidates)
         candidates = tuple((float(u), float(v)) for u, v in raw)
-        return SeedReply(thread, False, error.reason, stamp, candidates=candidates)
+        reason = f"{error.reason}; thread {thread} goes on as before" if is_kept else error.reason
+        return SeedReply(thread, False, reason, stamp, candidates=candidates)
 
 
 def _answer(case: _Case, reply: SeedReply) -> None:

@@ -87,6 +87,7 @@ def run(service: Service, config: SegmenterConfig) -> None:
             segmenter.forget(drop.thread)
             recorder.request(frame.stamp, drop)
         while (seed := seedings.get(0)) is not None:
+            segmenter.remember(seed.thread)
             learn(scaled(seed, 1 / rig.metres_per_unit), frame)
             recorder.request(frame.stamp, seed)
         adaptation.catch_up()

@@ -204,6 +204,37 @@ def test_patience_ends_beside_another_thread_as_well(rig: StereoRig) -> None:
     assert not tracker.is_sought("b")
 
 
+def test_a_seed_on_nothing_leaves_a_tracked_thread_as_it_is(rig: StereoRig) -> None:
+    fields, tracker = fields_of(rig, 45, range(45)), Tracker(rig)
+    tracker.seed(seed_on(rig, pair(0)[0], "a"))
+    states = []
+    for i, field in enumerate(fields):
+        if i == 5:
+            tracker.seed(Seed("a", pixel=(5.0, 5.0)))
+            assert tracker.is_sought("a")
+        states += tracker.step(field).states
+    (given_up,) = [i for i, state in enumerate(states) if "given up" in state.events]
+    assert 30 <= given_up - 5 < 30 + DELAY
+    assert not tracker.is_sought("a")
+    assert all(state.status is Status.TRACKING for state in states)
+    assert rms(states[-1], pair(44)[0]) < 0.15
+
+
+def test_a_tracked_thread_is_held_until_it_is_found_elsewhere(rig: StereoRig) -> None:
+    fields, tracker = fields_of(rig, 20, range(0)), Tracker(rig)
+    tracker.seed(seed_on(rig, pair(0)[0], "a"))
+    states = []
+    for i, field in enumerate(fields):
+        if i == 5:
+            tracker.seed(seed_on(rig, pair(5)[1], "a"))
+        states += tracker.step(field).states
+    (found,) = [i for i, state in enumerate(states) if i and "found" in state.events]
+    assert found == 5 + DELAY
+    assert all(state.status is Status.TRACKING for state in states)
+    for i, state in enumerate(states):
+        assert rms(state, pair(i)[i >= found]) < 0.15
+
+
 def test_what_is_found_again_is_followed_on_the_rows_that_show_it(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,7 +26,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import initialize
 from suturetrack.metrics import curve_error
-from suturetrack.segmentation import Segmenter
+from suturetrack.segmentation import SegmentationConfig, Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.types import RidgeField, Seed, Stamp, Status, StereoFrame, ThreadState, Truth
@@ -247,29 +247,61 @@ def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
     assert state.status is Status.TRACKING
 
 
+class Still:
+    """One picture again and again, as it is asked for: a line that only the left view shows has a look
+    that can be learned, but is no thread."""
+
+    LINE = 141.0, 60.0
+
+    def __init__(self) -> None:
+        self.scene, self._rig = open_scene("figure8-107"), Rig()
+        left, right = self.scene.render(0)
+        self._images, self._camera = (left.copy(), right), self._rig.connect("source")
+        self._images[0][58:62, 100:180] = 40, 200, 60
+        self._camera.answer(topics.CALIBRATION, lambda _: self.scene.rig)
+        self._steps, self.drops, self._fields, self.states = (
+            self._camera.every(topic)
+            for topic in (topics.STEP, topics.DROPPED, topics.FIELD, topics.STATE)
+        )
+        unchanging = SegmentationConfig(adapt=False)
+        config = SegmenterConfig(LOCKSTEP, segmentation=unchanging)
+        self._rig.start("segmenter", segmenter, config)
+        self._rig.start("tracker", tracker, TrackerConfig(LOCKSTEP))
+        assert self._camera.wait_for_alive("segmenter", 60)
+        assert self._camera.wait_for_alive("tracker", 60)
+
+    def play(self, frames: int, seeds: dict[int, Seed]) -> list[bytes]:
+        """The fields of so many frames, with seeds before some."""
+        seen = []
+        for frame in range(frames):
+            if frame in seeds:
+                with suppress(NoAnswer):
+                    self._camera.ask(topics.SEED, seeds[frame], timeout=0)
+            stamp = Stamp(frame, frame * 33_333_333, 0)
+            self._camera.publish(topics.FRAME, StereoFrame(stamp, *self._images))
+            assert self._steps.get(60) is not None
+            seen.append(next(iter(self._fields)).left.tobytes())
+        self._rig.stop()
+        assert not self._rig.errors
+        return seen
+
+
 def test_a_seed_on_nothing_leaves_no_trace_once_it_is_refused() -> None:
-    """One picture again and again: a line that only the left view shows teaches its look."""
-    scene, rig = open_scene("figure8-107"), Rig()
-    left, right = scene.render(0)
-    images, camera = (left.copy(), right), rig.connect("source")
-    images[0][58:62, 100:180] = 40, 200, 60
-    camera.answer(topics.CALIBRATION, lambda _: scene.rig)
-    steps, drops = camera.every(topics.STEP), camera.every(topics.DROPPED)
-    fields = camera.every(topics.FIELD)
-    rig.start("segmenter", segmenter, SegmenterConfig(LOCKSTEP))
-    rig.start("tracker", tracker, TrackerConfig(LOCKSTEP))
-    assert camera.wait_for_alive("segmenter", 60)
-    assert camera.wait_for_alive("tracker", 60)
-    seen = []
-    for frame in range(34):
-        if frame == 1:
-            with suppress(NoAnswer):
-                camera.ask(topics.SEED, Seed("wrong", pixel=(141.0, 60.0)), timeout=0)
-        camera.publish(topics.FRAME, StereoFrame(Stamp(frame, frame, 0), *images))
-        assert steps.get(60) is not None
-        seen.append(next(iter(fields)).left.tobytes())
-    rig.stop()
-    assert not rig.errors
-    assert [drop.thread for drop in drain(drops)] == ["wrong"]
+    still = Still()
+    seen = still.play(34, {1: Seed("wrong", pixel=still.LINE)})
+    assert [drop.thread for drop in drain(still.drops)] == ["wrong"]
     # Looked for in frames 1 to 30, and known to the segmenter in 2 to 30.
     assert [field == seen[0] for field in seen] == [not 2 <= i <= 30 for i in range(34)]
+
+
+def test_a_seed_on_nothing_takes_nothing_from_a_thread_that_is_tracked() -> None:
+    still = Still()
+    seeds = Seed("a", pixel=still.scene.seed_pixel()), Seed("a", pixel=still.LINE)
+    seen = still.play(50, {1: seeds[0], 5: seeds[1]})
+    states = drain(still.states)
+    (given_up,) = [s.stamp.frame for s in states if "given up" in s.events]
+    assert [field == seen[3] for field in seen[3:]] == [not 5 < i <= given_up for i in range(3, 50)]
+    assert drain(still.drops) == []
+    assert [s.events[0] for s in states if "found" in s.events] == ["found"]
+    assert all(s.curve is not None for s in states)
+    assert states[-1].status is Status.TRACKING

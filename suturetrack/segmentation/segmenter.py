@@ -47,6 +47,8 @@ class Segmenter:
         self._clear: dict[str, Contrast] = {}
         """As they were when they were seen last."""
         self._seeded: set[str] = set()
+        self._before: dict[str, tuple[Contrast, Contrast]] = {}
+        """Of threads that are looked for from another seed: the same two, as they were before it."""
         self._first = Sight(rig, config, first_look(config))
         self._sights: dict[str, Sight] = {}
         self._courses: dict[str, Course] = {}
@@ -121,9 +123,22 @@ class Segmenter:
             self._clear[seed.thread] = contrast
             self._look_for(seed.thread, contrast)
 
+    def remember(self, thread: str) -> None:
+        """Keep aside what was learned of a thread, until another seed at it is settled."""
+        if thread in self._threads and thread not in self._before:
+            self._before[thread] = self._threads[thread], self._clear[thread]
+
+    def settle(self, thread: str, *, is_found: bool) -> None:
+        """Keep what the seed has taught, if the thread was found from it, else what was remembered."""
+        before = self._before.pop(thread, None)
+        if before is not None and not is_found:
+            contrast, self._clear[thread] = before
+            self._look_for(thread, contrast)
+
     def forget(self, thread: str) -> None:
         """Look for a thread no more; without any, look as before the first was learned."""
         self._seeded.discard(thread)
+        self._before.pop(thread, None)
         if self._threads.pop(thread, None) is not None:
             del self._clear[thread], self._sights[thread], self._courses[thread]
             self._is_cut_out &= bool(self._threads)

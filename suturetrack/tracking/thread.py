@@ -39,6 +39,8 @@ _STUB = 0.5
 # The pause between looks at a curve that other ridges may draw aside, and the confidence of one by which
 # they have.
 _PAUSE_NS, _LIKELY = 500_000_000, 0.1
+FOUND, GIVEN_UP = "found", "given up"
+"""Events of what came of a seed."""
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
 
 
@@ -46,27 +48,24 @@ class Thread:
     """What is known of one seeded thread.
 
     Args:
-        patience: fields in which it is looked for from its seed.
-        toward: a curve that tells its direction.
+        seed: names it; where it was found first, if it was.
         last: where another tracker left it; lost.
     """
 
-    def __init__(
-        self,
-        seed: Seed,
-        setup: Setup,
-        patience: int,
-        *,
-        toward: Nurbs | None = None,
-        last: ThreadState | None = None,
-    ) -> None:
+    def __init__(self, seed: Seed, setup: Setup, last: ThreadState | None = None) -> None:
         self.name, self.looked_ns = seed.thread, -1
-        self._seed, self._setup, self._patience, self._toward = seed, setup, patience, toward
+        self._seed, self._sought, self._setup = seed, seed, setup
         self._state = self._followed = last or not_found(seed.thread, Stamp(0, 0, 0), ())
+        self._patience = 0
+        """Fields in which it is still looked for from the seed."""
+        self._know_nothing()
+        self._was_sure = last is not None
+
+    def _know_nothing(self) -> None:
         self._pursuit: Pursuit | None = None
         self._sureness: Sureness | None = None
         self._strangers = Strangers()
-        self._was_sure = last is not None
+        self._was_sure = False
         self._known: Follower | None = None
         """As it was who followed the thread when that was sure last."""
         self._longest = 0.0
@@ -76,6 +75,15 @@ class Thread:
         self._is_seed_shared = False
         """Whether another thread may be meant: no look can tell."""
         self._fields_to_rest = self._attempts = self._looks_in_vain = 0
+
+    def seek(self, seed: Seed) -> None:
+        """Has the thread looked for from a seed; until it is found there, it is held where it is."""
+        self._sought, self._patience = seed, self._setup.tracking.patience
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a curve, which may be lost."""
+        return self._state.curve is not None
 
     @property
     def is_held(self) -> bool:
@@ -95,8 +103,8 @@ class Thread:
 
     @property
     def is_sought(self) -> bool:
-        """Whether it has not been found from its seed yet, nor been given up."""
-        return self._state.curve is None and self._patience > 0
+        """Whether it has not been found from the last seed yet, nor been given up."""
+        return self._patience > 0
 
     @property
     def follower(self) -> Follower | None:
@@ -107,11 +115,6 @@ class Thread:
     def confidence(self) -> float:
         """The best of a look at the curve that is followed; 0 without one."""
         return 0.0 if self._sureness is None else self._sureness.confidence
-
-    @property
-    def direction(self) -> Nurbs | None:
-        """A curve that runs as the thread does."""
-        return self._state.curve or self._toward
 
     def state_at(self, stamp: Stamp, is_new: bool) -> ThreadState:
         """What has become of the thread."""
@@ -172,8 +175,10 @@ class Thread:
         Args:
             is_beside: whether others are tracked beside, so that it should not take long.
         """
-        if self._state.curve is None:
+        if self.is_sought:
             search = self._search_from_seed()
+        elif self._state.curve is None:
+            search = None
         elif self.is_astray:
             search = self._search_again(is_beside)
         else:
@@ -181,11 +186,9 @@ class Thread:
         self.looked_ns = now_ns if search else self.looked_ns
         return search
 
-    def _search_from_seed(self) -> Search | None:
-        if self._patience <= 0:
-            return None
+    def _search_from_seed(self) -> Search:
         self._patience -= 1
-        return FromSeed(self._seed, self._setup, self._toward)
+        return FromSeed(self._sought, self._setup, self._state.curve)
 
     def _search_again(self, is_beside: bool) -> Search | None:
         if self._fields_to_rest > 0:
@@ -260,12 +263,16 @@ class Thread:
         if isinstance(outcome.found, InitializationError):
             # The first field was counted, and the last one is the first of the next look.
             self._patience -= max(fields - 2, 0)
-            self._state = replace(self._state, events=(f"not found: {outcome.found.reason}",))
+            given_up = () if self.is_sought else (GIVEN_UP,)
+            events = (f"not found: {outcome.found.reason}", *given_up, *self._state.events)
+            self._state = replace(self._state, events=events)
             return
         assert outcome.found is not None
+        self._know_nothing()
+        self._seed, self._patience = self._sought, 0
         self._seeded_at = _nearest(outcome.found.curve, self._seed, self._setup.rig)
         self._is_seed_shared = outcome.found.is_seed_shared
-        self._hold(outcome, "found")
+        self._hold(outcome, FOUND)
 
     def _take_again(self, outcome: Outcome, known_lengths: tuple[float, ...]) -> None:
         """A thread that is held still gives way only to a curve that is sure."""

@@ -16,7 +16,7 @@ from suturetrack.tracking.clock import StreamClock
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.looks import Look
 from suturetrack.tracking.recovery import Setup
-from suturetrack.tracking.searches import Closer, FromSeed
+from suturetrack.tracking.searches import Again, Closer, FromSeed
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.tracking.thread import Thread, not_found
 from suturetrack.types import RidgeField, Seed, Stamp, Status, ThreadState
@@ -62,12 +62,9 @@ class Tracker:
     def seed(self, seed: Seed) -> None:
         """Looks for the thread from the next field on, for up to `config.patience` fields.
 
-        A thread of the same name is looked for anew, and keeps its direction.
+        A thread of the same name is held where it is until it is found there, and keeps its direction.
         """
-        before = self._threads.get(seed.thread)
-        toward = None if before is None else before.direction
-        patience = self._setup.tracking.patience
-        self._threads[seed.thread] = Thread(seed, self._setup, patience, toward=toward)
+        self._threads.setdefault(seed.thread, Thread(seed, self._setup)).seek(seed)
         self._drop_look(seed.thread)
 
     def resume(self, seed: Seed, last: ThreadState) -> None:
@@ -81,7 +78,7 @@ class Tracker:
         some attempts in vain whatever its length is, for the last state may have been a bad one.
         """
         last = replace(last, status=Status.LOST, events=())
-        self._threads[seed.thread] = Thread(seed, self._setup, 0, last=last)
+        self._threads[seed.thread] = Thread(seed, self._setup, last)
         self._drop_look(seed.thread)
 
     def forget(self, thread: str) -> bool:
@@ -95,8 +92,12 @@ class Tracker:
             self._forgotten.append(thread)
         return known
 
+    def is_known(self, thread: str) -> bool:
+        """Whether there is a curve of the thread, held or lost."""
+        return thread in self._threads and self._threads[thread].is_known
+
     def is_sought(self, thread: str) -> bool:
-        """Whether the thread has been seeded, not been found yet, and not been given up."""
+        """Whether the thread has been seeded, not been found there yet, and not been given up."""
         return thread in self._threads and self._threads[thread].is_sought
 
     def step(self, field: RidgeField) -> TrackerStep:
@@ -155,7 +156,7 @@ class Tracker:
                 continue
             own = field.of(thread.name)
             look = Look(search, own)
-            if is_beside or isinstance(search, Closer):
+            if is_beside or (thread.is_held and not isinstance(search, Again)):
                 look.add(self._worker, own, self._others(thread, field.stamp))
                 self._look = look
             else:
