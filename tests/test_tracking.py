@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -130,6 +131,24 @@ def test_another_tracker_takes_a_thread_up(rig: StereoRig, away_s: float) -> Non
     start, stop = nurbs.evaluate(states[-1].curve, np.array([0.0, 1.0]))
     fixed = truths[0][0]  # where the thread is held, and the reversed curve ends
     assert np.linalg.norm(stop - fixed) < np.linalg.norm(start - fixed)
+
+
+@pytest.mark.parametrize("status", [Status.TRACKING, Status.OCCLUDED])
+def test_another_tracker_does_not_take_a_thread_for_surer_than_it_was(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, status: Status
+) -> None:
+    def in_doubt(*args: Any) -> Initialization:
+        return replace(initialize(*args), confidence=0.6)
+
+    points = thread(0.0)
+    seed, fields = seed_on(rig, points), [paint(rig, [points], i) for i in range(8)]
+    (last,) = follow(fields[:1], rig, seed)
+    monkeypatch.setattr("suturetrack.tracking.recovery.initialize", in_doubt)
+    tracker = Tracker(rig)
+    tracker.resume(seed, replace(last, status=status))
+    states = [tracker.step(field).states[0] for field in fields[1:]]
+    assert "found again" in states[0].events
+    assert {state.status for state in states} == {status}
 
 
 def test_another_tracker_is_not_kept_from_a_thread_by_a_bad_last_state(rig: StereoRig) -> None:
@@ -683,14 +702,20 @@ def test_an_end_beneath_another_thread_is_no_shorter(rig: StereoRig) -> None:
 
 def test_a_thread_that_is_seeded_again_keeps_its_direction(rig: StereoRig) -> None:
     points = thread(0.0)
-    tracker, states = Tracker(rig), []
-    for frame, at in enumerate((100, 500, 300)):
+    tracker, states, frames = Tracker(rig), [], itertools.count()
+
+    def seek(at: int) -> None:
         tracker.seed(seed_on(rig, points[at : at + 1]))
-        states += tracker.step(paint(rig, [points], frame)).states
+        while tracker.is_sought("0"):
+            (state,) = tracker.step(paint(rig, [points], next(frames))).states
+        assert "found" in state.events
+        states.append(state)
+
+    for at in (100, 500, 300):
+        seek(at)
     turned = replace(states[0], curve=nurbs.reversed_curve(states[0].curve))
     tracker.resume(seed_on(rig, points), turned)
-    tracker.seed(seed_on(rig, points))
-    states += tracker.step(paint(rig, [points], 3)).states
+    seek(300)
     starts = [s.curve.control_points[0] for s in states if s.curve is not None]
     np.testing.assert_allclose(starts[1:3], [starts[0]] * 2, atol=2.0)
     assert np.linalg.norm(starts[3] - turned.curve.control_points[0]) < 2.0

@@ -49,17 +49,18 @@ class Thread:
 
     Args:
         seed: names it; where it was found first, if it was.
-        last: where another tracker left it; lost.
+        last: where another tracker left it.
     """
 
     def __init__(self, seed: Seed, setup: Setup, last: ThreadState | None = None) -> None:
         self.name, self.looked_ns = seed.thread, -1
         self._seed, self._sought, self._setup = seed, seed, setup
-        self._state = self._followed = last or not_found(seed.thread, Stamp(0, 0, 0), ())
+        state = last or not_found(seed.thread, Stamp(0, 0, 0), ())
+        self._state = self._followed = replace(state, status=Status.LOST, events=())
         self._patience = 0
         """Fields in which it is still looked for from the seed."""
         self._know_nothing()
-        self._was_sure = last is not None
+        self._was_sure = last is not None and last.status is Status.TRACKING
 
     def _know_nothing(self) -> None:
         self._pursuit: Pursuit | None = None
@@ -291,7 +292,8 @@ class Thread:
         if is_worse and is_whole and outcome.state.status is Status.TRACKING:
             is_same = self._was_followed_for_sure(outcome.state.curve)
             before = self._sureness if is_same else None
-            self._hold(outcome, "found again", before, is_known=bool(known_lengths))
+            is_known = self._was_sure and bool(known_lengths)
+            self._hold(outcome, "found again", before, is_known=is_known)
 
     def _was_followed_for_sure(self, found: Nurbs) -> bool:
         """Whether it is what was followed for sure before it was lost, and beside the search."""

@@ -19,7 +19,7 @@ from suturetrack.tracking.recovery import Setup
 from suturetrack.tracking.searches import Again, Closer, FromSeed
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.tracking.thread import Thread, not_found
-from suturetrack.types import RidgeField, Seed, Stamp, Status, ThreadState
+from suturetrack.types import RidgeField, Seed, Stamp, ThreadState
 
 FORGOTTEN = "forgotten"
 """Event of the last state of a thread that was dropped."""
@@ -75,9 +75,9 @@ class Tracker:
             last: its last state, with a curve.
 
         It keeps the direction of the last curve, and counts as found if it has the same length; after
-        some attempts in vain whatever its length is, for the last state may have been a bad one.
+        some attempts in vain whatever its length is, for the last state may have been a bad one. What was
+        not tracked for sure is no surer than before.
         """
-        last = replace(last, status=Status.LOST, events=())
         self._threads[seed.thread] = Thread(seed, self._setup, last)
         self._drop_look(seed.thread)
 
