@@ -51,7 +51,5 @@ def run(config: SeedConfig) -> None:
                 thread=config.thread,
             )
         except Refused as refusal:
-            near = ", ".join(f"{u:.0f} {v:.0f}" for u, v in refusal.candidates)
-            hint = f"; pixels that look like thread: {near}" if near else ""
-            raise InputError(f"{refusal}{hint}") from refusal
+            raise InputError(str(refusal)) from refusal
     print(f"thread {config.thread}: {found.reason}")

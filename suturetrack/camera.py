@@ -246,8 +246,10 @@ class StereoRig:
             pixel = self.rectify_pixels(np.asarray(seed.pixel, float))
         width, height = self.image_size
         if not (-0.5 <= pixel[0] <= width - 0.5 and -0.5 <= pixel[1] <= height - 0.5):
+            u, v = seed.pixel or pixel
+            once = "" if self.is_rectified else ", once that is rectified"
             raise InputError(
-                f"seed ({pixel[0]:.0f}, {pixel[1]:.0f}) is outside the {width}x{height} left image"
+                f"seed ({u:.0f}, {v:.0f}) is outside the {width}x{height} left image{once}"
             )
         return pixel
 

@@ -11,6 +11,7 @@ import numpy as np
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationConfig, InitializationError, initialize
+from suturetrack.initialization.result import nearest_ridges
 from suturetrack.initialization.segments import find_ridges, nearest_segment
 from suturetrack.metrics import nearest_index
 from suturetrack.types import Float32, Float64, Image, InputError, Nurbs, RidgeField, Seed
@@ -196,7 +197,8 @@ def point_of_right_pixel(
     """
     found, candidates = snap_pixel(field.right, pixel, config)
     if found is None:
-        raise InitializationError("the right view shows no thread there", candidates)
+        near = nearest_ridges(candidates, rig, right=True)
+        raise InitializationError(f"the right view shows no thread there; {near}", candidates)
     best, most = None, -1.0
     curves: list[Nurbs] = []
     for left in _on_row(field, rig, found.pixel, config):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -115,6 +117,20 @@ def test_a_seed_on_nothing_is_refused_with_the_nearest_ridge(rig: StereoRig, cur
     nearest = np.linalg.norm(left[:, None] - refusal.value.candidates, axis=2).min(0)
     assert len(nearest) >= 1
     assert nearest.max() < 2
+
+
+def test_a_refusal_speaks_of_the_pixels_of_the_raw_image(
+    distorted_rig: StereoRig, curve: Nurbs
+) -> None:
+    shown = distorted_rig.project_raw(dense(curve))
+    field = field_of(*(draw(view, distorted_rig) for view in shown), distorted_rig)
+    with pytest.raises(InitializationError) as refusal:
+        initialize(field, distorted_rig, Seed(pixel=(60.0, 40.0)))
+    said = re.findall(r"\((-?\d+), (-?\d+)\)", refusal.value.reason)
+    seed, *near = np.array(said, float)
+    assert seed.tolist() == [60, 40]
+    assert len(near) >= 1
+    assert polyline_distances(np.array(near), shown[0]).max() < 2
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,8 @@ from suturetrack.initialization.result import (
     InitializationError,
     PlacedDoubts,
     ViewGrowth,
+    in_words,
+    nearest_ridges,
     remaining,
 )
 from suturetrack.initialization.segments import Ridges, find_ridges, nearest_segment, thread_scale
@@ -112,7 +114,9 @@ def _initialize(
     """As `initialize`, in a field reduced by `scale`; only texts have pixels of the whole image."""
     origin, candidates = nearest_segment(left, pixel, config.snap_px)
     if origin is None:
-        reason = _nothing_there(scale * candidates, scale * pixel, config)
+        (at,) = in_words(pixel[None], rig, scale)
+        near = nearest_ridges(candidates, rig, scale)
+        reason = f"no thread within {config.snap_px:g} px of the seed {at}; {near}"
         raise InitializationError(reason, candidates)
     thread = follow_thread(left, origin, config)
     start = _Start(left, thread, candidates, rig, pixel, config, scale)
@@ -242,11 +246,3 @@ def _no_match(swapped: bool) -> str:
     if swapped:
         reason += ", but it does on the other side: left and right are swapped"
     return reason
-
-
-def _nothing_there(candidates: Float64, pixel: Float64, config: InitializationConfig) -> str:
-    text = f"no thread within {config.snap_px:g} px of the seed ({pixel[0]:.0f}, {pixel[1]:.0f})"
-    if len(candidates) == 0:
-        return text + "; the left view shows no ridge at all"
-    near = ", ".join(f"({u:.0f}, {v:.0f})" for u, v in candidates)
-    return f"{text}; the nearest ridges are at {near}"

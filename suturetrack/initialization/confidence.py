@@ -17,7 +17,7 @@ from suturetrack.initialization.doubts import (
     SHARP,
     Doubt,
 )
-from suturetrack.initialization.result import PlacedDoubts, remaining
+from suturetrack.initialization.result import PlacedDoubts, in_words, remaining
 from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.threads import Chain
@@ -94,10 +94,10 @@ def judge(
     if max(_others(line, r) for line, r in zip(pixels, ridges, strict=True)) <= _NEXT_TO_NOTHING:
         doubts = [[_of_itself(doubt) for doubt in of_view] for of_view in doubts]
     for view, name in enumerate(("left", "right")):
-        reasons += [
-            f"{why} in the {name} view at ({scale * u:.0f}, {scale * v:.0f})"
-            for (u, v), why, _ in doubts[view]
-        ]
+        places = np.array([pixel for pixel, _, _ in doubts[view]]).reshape(-1, 2)
+        said = in_words(places, rig, scale, right=bool(view))
+        whys = [why for _, why, _ in doubts[view]]
+        reasons += [f"{w} in the {name} view at {p}" for w, p in zip(whys, said, strict=True)]
     left, right = (_placed(view, doubts, pixels, chains) for view in (0, 1))
     confidence *= remaining((left, right))
     for end, ordinal in enumerate(("first", "last")):

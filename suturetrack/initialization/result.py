@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from suturetrack.camera import StereoRig
 from suturetrack.types import Float32, Float64, Nurbs
 
 PlacedDoubts = tuple[tuple[tuple[float, float], ...], tuple[tuple[float, float], ...]]
@@ -91,6 +92,21 @@ class Initialization:
         reasons = (_EITHER, *others) if either else others
         confidence = self.confidence * _MEANT if either else self.confidence / _MEANT
         return replace(self, confidence=confidence, reasons=reasons, is_seed_shared=either)
+
+
+def in_words(pixels: Float64, rig: StereoRig, scale: int = 1, *, right: bool = False) -> list[str]:
+    """(k, 2) rectified pixels of a view, as those of its raw image that people look at."""
+    raw = scale * rig.raw_pixels(pixels, right=right)
+    return [f"({u:.0f}, {v:.0f})" for u, v in raw]
+
+
+def nearest_ridges(
+    candidates: Float64, rig: StereoRig, scale: int = 1, *, right: bool = False
+) -> str:
+    """What is said of the ridges near a seed that is on none."""
+    if not candidates.size:
+        return f"the {'right' if right else 'left'} view shows no ridge at all"
+    return f"the nearest ridges are at {', '.join(in_words(candidates, rig, scale, right=right))}"
 
 
 class InitializationError(Exception):
