@@ -6,16 +6,16 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.tracking.sampling import Samples, views
-from suturetrack.types import Energies, Float64, Nurbs, RidgeField
+from suturetrack.types import Energies, Float32, Float64, Nurbs, RidgeField
 
 
 def energies(
-    curve: Nurbs, field: RidgeField, rig: StereoRig, cutoffs: tuple[float, float]
+    curve: Nurbs, field: RidgeField, rig: StereoRig, levels: tuple[float, float]
 ) -> Energies:
     """Eqs. (4) and (7) of the curve in the field, and its bending.
 
     Args:
-        cutoffs: |V_c| of eq. (7), left and right.
+        levels: response of a clear view of the thread, left and right.
     """
     samples = Samples.of(curve.knots, 5)
     points, first, second = (samples.values(curve.control_points, d) for d in range(3))
@@ -24,7 +24,7 @@ def energies(
         for image, view in zip((field.left, field.right), views(rig, points, first), strict=True)
     ]
     return Energies(
-        images[0], images[1], _end(curve, field, rig, cutoffs), _bending(first, second, samples)
+        images[0], images[1], _end(curve, field, rig, levels), _bending(first, second, samples)
     )
 
 
@@ -39,12 +39,18 @@ def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[flo
     return max(left, 0.05), max(right, 0.05)
 
 
-def _end(curve: Nurbs, field: RidgeField, rig: StereoRig, cutoffs: tuple[float, float]) -> float:
+def cutoff(image: Float32, level: float) -> float:
+    """|V_c| of eq. (7): midway between the mean magnitudes of the thread and of the background."""
+    sparse = image[::8, ::8]
+    return (level + float(np.hypot(sparse[..., 0], sparse[..., 1]).mean())) / 2
+
+
+def _end(curve: Nurbs, field: RidgeField, rig: StereoRig, levels: tuple[float, float]) -> float:
     ends = Samples.at(curve.knots, np.array([0.0, 1.0]))
     both = ends.views(rig, curve.control_points)
     return sum(
-        float(np.sum((view.responses(image) - cutoff) ** 2))
-        for image, view, cutoff in zip((field.left, field.right), both, cutoffs, strict=True)
+        float(np.sum((view.responses(image) - cutoff(image, level)) ** 2))
+        for image, view, level in zip((field.left, field.right), both, levels, strict=True)
     )
 
 

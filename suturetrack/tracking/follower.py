@@ -19,7 +19,7 @@ from suturetrack.tracking.detours import led_back
 from suturetrack.tracking.drift import Drift, HiddenEnds
 from suturetrack.tracking.end_watch import EndWatch
 from suturetrack.tracking.ends import EndStep, find_end, with_ends
-from suturetrack.tracking.energies import energies, measure_levels
+from suturetrack.tracking.energies import cutoff, energies, measure_levels
 from suturetrack.tracking.fitting import fit_widely
 from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.images import Images
@@ -278,7 +278,7 @@ class Follower:
         self, images: Images, neighbours: Neighbours
     ) -> tuple[Evidence, int, int]:
         model, config = self.model, self.config
-        left, right = map(paper.cutoff, images.both, images.levels)
+        left, right = map(cutoff, images.both, images.levels)
         curve = paper.fit(model.curve, images.field, self.rig, (left, right), config.paper)
         fit = gauss_newton.observe(curve, images, config, neighbours)
         model.curve, inserted, removed = respace(curve, self.rig, config.paper.spacing_px)
@@ -429,14 +429,13 @@ class Follower:
         model = self.model
         sigma = evidence.sigma
         depth = values_at(model.curve, np.linspace(0, 1, len(sigma)))[:, 2]
-        cutoffs = model.levels[0] / 2, model.levels[1] / 2
         return ThreadState(
             stamp=field.stamp,
             thread=thread,
             status=status,
             curve=model.curve,
             length=length_of(model.curve),
-            energies=energies(model.curve, field, self.rig, cutoffs),
+            energies=energies(model.curve, field, self.rig, model.levels),
             sigma=np.hypot(sigma, self._drift.px * depth / self.rig.focal),
             seen=evidence.evenly_seen,
             events=tuple(events),

@@ -65,12 +65,6 @@ def fit(
     return curve_from(curve.degree, curve.knots, control_points)
 
 
-def cutoff(image: Float32, level: float) -> float:
-    """|V_c| of eq. (7): midway between the mean magnitudes of the thread and of the background."""
-    sparse = image[::8, ::8]
-    return (level + float(np.hypot(sparse[..., 0], sparse[..., 1]).mean())) / 2
-
-
 def _point_offsets(
     samples: Samples,
     control_points: Float64,
