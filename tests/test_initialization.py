@@ -468,6 +468,17 @@ def test_a_thread_that_may_have_run_into_another_one_is_doubtful(
     assert any("another strand that ends on it" in why for why in found.reasons) == is_joined
 
 
+@pytest.mark.parametrize("seed", [1708, 1761])
+def test_a_thread_whose_end_lies_on_a_fainter_one_ends_there(seed: int) -> None:
+    """Where the two come together the other one seems to end, and behind the end it goes on."""
+    scene = open_scene("two-threads", seed)
+    field, start = field_and_seed(scene)
+    found = initialize(field, scene.rig, start)
+    error = curve_error(dense(found.curve), scene.truth(0)[0].points)
+    assert error.rms < 0.3
+    assert max(error.ends) < 1
+
+
 def test_a_part_that_is_shorter_than_the_gap_before_it_may_be_something_else() -> None:
     """A highlight on the table lies where a white thread would go on."""
     scene = open_scene("two-threads", 598)

@@ -77,7 +77,7 @@ def doubts(joints: Joints, entries: list[int], ridges: Ridges) -> list[Doubt]:
         Doubt(inward(joints.segments, end)[0], why, rest)
         for end, why, rest in (
             *_at_merges(joints, entries),
-            *((end, JOINED, _FOREIGN) for end in _joining(joints, entries, ridges)),
+            *((end, JOINED, _FOREIGN) for end in joining(joints, entries, ridges)),
             *_at_tips(joints, entries, ridges),
         )
     ]
@@ -119,7 +119,7 @@ def _lead(joints: Joints, entry: int, entries: list[int], within: dict[int, list
     return max(min(added, default=1.0), 0.0)
 
 
-def _joining(joints: Joints, entries: list[int], ridges: Ridges) -> list[int]:
+def joining(joints: Joints, entries: list[int], ridges: Ridges) -> list[int]:
     """The free ends of other strands, clear enough for threads, that run into its side."""
     own = [inward(joints.segments, e) for e in entries]
     line, tangents = np.concatenate(own), np.concatenate([chain_tangents(s) for s in own])

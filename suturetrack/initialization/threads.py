@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
-from suturetrack.initialization.doubts import FADES, Doubt, doubts
+from suturetrack.initialization.doubts import FADES, Doubt, doubts, joining
 from suturetrack.initialization.joints import Joints, inward
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
@@ -23,6 +23,8 @@ _FALLEN = 0.42
 """Strength, against the rest of the thread, of what goes on behind its end at most."""
 _FALL = 0.5
 """Ratio of the strengths behind and before such an end at most: threads fade more slowly."""
+_STEP, _LOWER = 0.7, 0.85
+"""That ratio and that share where a strand that ends on the thread may be what goes on."""
 _FAINTER = 0.49
 """What such an end leaves of the confidence."""
 _SHORTEST_TAIL = 24
@@ -118,8 +120,11 @@ def without_faint_tails(thread: Thread, place: Float64) -> Thread:
     chain = thread.chain
     strength = thread.ridges.sample(chain.pixels)
     near = nearest_index(chain.pixels, place)
-    stop = _falls_at(strength, near)
-    start = len(strength) - _falls_at(strength[::-1], len(strength) - 1 - near)
+    met = _strands_met(thread)
+    stop = _stops_at(strength, near, met)
+    last = len(strength) - 1
+    met = [(last - at, level) for at, level in met]
+    start = len(strength) - _stops_at(strength[::-1], last - near, met)
     if stop - start == len(strength):
         return thread
     pixels = chain.pixels[start:stop]
@@ -129,8 +134,30 @@ def without_faint_tails(thread: Thread, place: Float64) -> Thread:
     return replace(thread, chain=Chain(pixels, tuple(left)))
 
 
-def _falls_at(strength: Float64, first: int) -> int:
-    """Where behind the point `first` a chain falls far below its strength; its length if nowhere."""
+def _strands_met(thread: Thread) -> list[tuple[int, float]]:
+    """At which points of the chain other strands end, and how strong they are."""
+    joints, ridges, pixels = thread.joints, thread.ridges, thread.chain.pixels
+    arms = [inward(joints.segments, end) for end in joining(joints, thread.entries, ridges)]
+    return [(nearest_index(pixels, arm[0]), float(np.median(ridges.sample(arm)))) for arm in arms]
+
+
+def _stops_at(strength: Float64, first: int, met: list[tuple[int, float]]) -> int:
+    """Where behind the point `first` a vein, or a strand that the thread met before, goes on behind its end;
+    the length of the chain if nowhere."""
+    stops = [_falls_at(strength, first, _FALL, _FALLEN)]
+    own = float(np.median(strength))
+    for at, level in met:
+        if at > first:
+            start = max(first, at - _WINDOW - _STEP_POINTS)
+            # What goes on is that strand if it is more like that one than like the thread.
+            fallen = min(_LOWER, float(np.sqrt(level / own)))
+            stops.append(_falls_at(strength, start, _STEP, fallen))
+    return min(stops)
+
+
+def _falls_at(strength: Float64, first: int, fall_to: float, fallen: float) -> int:
+    """Where behind the point `first` a chain falls at once to the share `fall_to` of its strength there, and
+    for good to the share `fallen` of the whole; its length if nowhere."""
     aside = _WINDOW + _STEP_POINTS
     if len(strength) <= first + aside + _SHORTEST_TAIL:
         return len(strength)
@@ -139,9 +166,9 @@ def _falls_at(strength: Float64, first: int) -> int:
     fall = medians[places + _STEP_POINTS] / np.maximum(medians[places - aside], 1e-9)
     for k in np.argsort(fall):
         place = int(places[k])
-        if fall[k] > _FALL:
+        if fall[k] > fall_to:
             break
-        if np.median(strength[place:]) < _FALLEN * np.median(strength[:place]):
+        if np.median(strength[place:]) < fallen * np.median(strength[:place]):
             return place
     return len(strength)
 
