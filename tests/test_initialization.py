@@ -468,10 +468,13 @@ def test_a_thread_that_may_have_run_into_another_one_is_doubtful(
     assert any("another strand that ends on it" in why for why in found.reasons) == is_joined
 
 
-@pytest.mark.parametrize("seed", [1708, 1761])
-def test_a_thread_whose_end_lies_on_a_fainter_one_ends_there(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("seed", "rig"),
+    [(1708, "bench"), (1761, "bench"), (1748, "bench"), (1746, "endoscope")],
+)
+def test_a_thread_whose_end_lies_on_a_fainter_one_ends_there(seed: int, rig: str) -> None:
     """Where the two come together the other one seems to end, and behind the end it goes on."""
-    scene = open_scene("two-threads", seed)
+    scene = open_scene("two-threads", seed, rig)
     field, start = field_and_seed(scene)
     found = initialize(field, scene.rig, start)
     error = curve_error(dense(found.curve), scene.truth(0)[0].points)

@@ -180,11 +180,13 @@ def _reconstruct(start: _Start, field: RidgeField) -> Initialization:
         swapped = _is_matched(other)
         raise InitializationError(_no_match(swapped), start.candidates, growth, swapped=swapped)
     views = (
-        View(field.left, found.left.others),
-        View(field.right, np.empty((0, 2)) if found.right is None else found.right.others),
+        View(found.left.field, found.left.others),
+        View(field.right, np.empty((0, 2)))
+        if found.right is None
+        else View(found.right.field, found.right.others),
     )
     try:
-        curve = _first_curve(_trim(found.pixels, start.left), rig, config)
+        curve = _first_curve(_trim(found.pixels, found.left), rig, config)
         curve, samples, sigma, rows = refine(curve, views, rig)
     except FloatingPointError as error:
         reason = f"no curve fits both views: {error}"
@@ -212,9 +214,9 @@ def _reduced(view: Float32, scale: int) -> Float32:
     return reduced
 
 
-def _trim(pixels: Float64, left: Ridges) -> Float64:
+def _trim(pixels: Float64, left: Thread) -> Float64:
     """Moves both ends of the (k, 4) chain, left and right pixels, to where the left thread ends."""
-    shown = left.sample(pixels[:, :2])
+    shown = left.ridges.sample(pixels[:, :2])
     inside = np.flatnonzero(shown >= _FAINT * np.median(shown))
     pixels = pixels[inside[0] : inside[-1] + 1]
     for _ in (0, 1):

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import binary_dilation
+from scipy.spatial import cKDTree
 
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
@@ -15,7 +18,7 @@ from suturetrack.initialization.joints import Joints, inward
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
 from suturetrack.metrics import arc_lengths, nearest_index, polyline_distances, resample
-from suturetrack.types import Float64
+from suturetrack.types import Float32, Float64
 
 _FAINT = 0.4
 """Strength, against the rest of the thread, below which a last segment is no part of it."""
@@ -37,6 +40,8 @@ at most."""
 _LEAVES_PX, _AROUND_PX = 6.0, 60.0
 """How far away from the thread it leads, at least, and how far around the seed: what runs along the thread
 for longer is a part of it that was doubled."""
+_BESIDE_PX = 5
+"""How far beside its crest a ridge shows."""
 _WINDOW, _STEP_POINTS = 10, 3
 """Points whose strength counts on each side of an end, and those about it that do not."""
 
@@ -64,6 +69,26 @@ class Thread:
     origin: int
     """The segment that the seed lies on."""
     chain: Chain
+    behind: Float64
+    """(k, 2) pixels of what goes on behind the ends at which the chain was cut."""
+
+    @cached_property
+    def field(self) -> Float32:
+        """(H, W, 2) that of the view, without what goes on behind the ends."""
+        whole = self.ridges.field
+        if not len(self.behind):
+            return whole
+        near = np.zeros(whole.shape[:2], bool)
+        near[tuple(np.rint(self.behind[:, ::-1]).astype(int).T)] = True
+        places = np.argwhere(binary_dilation(near, np.ones((3, 3), bool), _BESIDE_PX))
+        behind, own = (
+            cKDTree(p).query(places[:, ::-1])[0] for p in (self.behind, self.chain.pixels)
+        )
+        field = whole.copy()
+        field[tuple(places[behind < own].T)] = 0
+        # As fields from the wire are: kernels are compiled apart for arrays that may be written to.
+        field.flags.writeable = False
+        return field
 
     @property
     def pieces(self) -> list[Float64]:
@@ -111,7 +136,7 @@ def follow_thread(
     entries = _without_faint_ends(ridges, joints.follow(origin), origin)
     line = _join([inward(ridges.segments, entry) for entry in entries])
     chain = Chain(line, tuple(doubts(joints, entries, ridges)))
-    return Thread(ridges, joints, entries, origin, chain)
+    return Thread(ridges, joints, entries, origin, chain, np.empty((0, 2)))
 
 
 def without_faint_tails(thread: Thread, place: Float64) -> Thread:
@@ -131,7 +156,8 @@ def without_faint_tails(thread: Thread, place: Float64) -> Thread:
     left = [d for d in chain.doubts if np.linalg.norm(pixels - d.place, axis=1).min() < _WINDOW]
     cut = [end for end, at in ((0, start), (-1, len(strength) - stop)) if at > 0]
     left += [Doubt(pixels[end], FADES, _FAINTER) for end in cut]
-    return replace(thread, chain=Chain(pixels, tuple(left)))
+    behind = np.concatenate([chain.pixels[:start], chain.pixels[stop:]])
+    return replace(thread, chain=Chain(pixels, tuple(left)), behind=behind)
 
 
 def _strands_met(thread: Thread) -> list[tuple[int, float]]:
@@ -169,7 +195,9 @@ def _falls_at(strength: Float64, first: int, fall_to: float, fallen: float) -> i
         if fall[k] > fall_to:
             break
         if np.median(strength[place:]) < fallen * np.median(strength[:place]):
-            return place
+            level = (medians[place - aside] + medians[place + _STEP_POINTS]) / 2
+            above = np.cumsum(strength[place - aside : place + aside] - level)
+            return place - aside + int(np.argmax(above)) + 1
     return len(strength)
 
 
