@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Literal, Self
 
 import psutil
 
-from services import topics
-from services.bus import Bus
+from services import topics, wire
+from services.bus import Bus, NoAnswer
 from services.checks import check_name
 from services.messages import Health
 from services.meter import Meter
@@ -38,6 +38,8 @@ HEARTBEAT_S = 1.0
 _GRACE_S = 1.2
 """From the wish to stop until a step that takes too long is interrupted."""
 _COMPLAINT_INTERVAL_S = 1.0
+_CALIBRATION_S = 0.2
+"""How long a source may take to tell its calibration once more."""
 _SHARING = 8
 """Who died so often sends without shared memory: its readers keep that of everyone who died, up to 40 MB
 each at 640x480, until they end themselves (eclipse-zenoh/zenoh, issue 2787)."""
@@ -92,6 +94,9 @@ class Service:
         self.awaits = ""
         """Without what it cannot go on at present, for the health; empty when it can."""
         self._ready = False
+        self._rig: StereoRig | None = None
+        self.fault = ""
+        """Why it cannot go on at all, in words; empty when it can."""
         self._unrecorded: deque[Health] = deque(maxlen=8)
         self._complaints: deque[str] = deque(maxlen=8)
         """Those from before the recording."""
@@ -100,11 +105,15 @@ class Service:
         bus.complain = self.complain
 
     def calibrated_rig(self) -> StereoRig:
-        """The rig as the source tells it, as soon as there is a source; raises Stopped."""
+        """The rig as the source tells it, as soon as there is a source; raises Stopped.
+
+        A source that comes back with another calibration ends the process.
+        """
         with self.waiting("source"):
             rig = self.bus.ask_until_answered(topics.CALIBRATION, None)
         if rig is None:
             raise Stopped
+        self._rig = rig
         return rig
 
     @contextmanager
@@ -204,6 +213,17 @@ class Service:
             self.bus.publish(topics.HEALTH, health)
             if health.ready:
                 self._unrecorded.append(health)
+            if self._rig is not None and self._is_calibrated_anew(self._rig):
+                self.fault = "the source has another calibration now; start this process again"
+                self.bus.stop.set()
+
+    def _is_calibrated_anew(self, rig: StereoRig) -> bool:
+        """Whether the source, which may be another one by now, tells of other cameras than these."""
+        try:
+            now = self.bus.ask(topics.CALIBRATION, None, _CALIBRATION_S)
+        except NoAnswer:
+            return False
+        return wire.encode(now) != wire.encode(rig)
 
 
 @contextmanager
@@ -246,6 +266,8 @@ def run(name: str, config: ServiceConfig, body: Callable[[Service], None]) -> No
             body(service)
     except Stopped:
         log.info("stopped")
+    if service.fault:
+        raise InputError(service.fault)
 
 
 def _stop_with(parent: int, bus: Bus) -> None:

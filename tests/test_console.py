@@ -58,7 +58,7 @@ class Stage:
         self.names = [Bus(hub.connect(), "rig", name) for name in ("source", "tracker")]
         for bus in self.names:
             bus.declare_alive()
-        self.system.answer(topics.CALIBRATION, lambda _: rig)
+        self.system.answer(topics.CALIBRATION, lambda _: self.rig)
         self.system.answer(topics.SEED, self.find)
         self.system.answer(topics.FORGET, lambda f: Forgotten(f.thread, True))
         self.feed = Feed(feed, Recording("rig", None))
@@ -407,3 +407,12 @@ def test_a_recording_may_say_much_and_its_last_word_is_told(
     wait_until((tmp_path / "said").exists)
     with pytest.raises(InputError, match="failed: record: the disk is full"):
         recording.stop()
+
+
+def test_a_source_that_comes_back_may_have_another_calibration(stage: Stage) -> None:
+    stage.feed.start()
+    stage.feed.watched.set()
+    wait_until(lambda: stage.feed.rig is not None)
+    stage.silent.set()
+    stage.rig = replace(stage.rig, metres_per_unit=0.5)
+    wait_until(lambda: stage.feed.rig is not None and stage.feed.rig.metres_per_unit == 0.5)

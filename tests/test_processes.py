@@ -173,6 +173,24 @@ def test_signals_end_each_process_cleanly_and_soon(
     assert folder.states()
 
 
+def test_a_source_that_comes_back_with_another_calibration_ends_the_others(
+    start: Callable[..., subprocess.Popen[str]], rig_name: str
+) -> None:
+    options = ("--rig", rig_name)
+    seed = open_scene("figure8-107").seed_pixel(0)
+    tracker = start("tracker", *options, "--seed", *seed)
+    segmenter = start("segmenter", *options, "--seed", *seed)
+    source = start("source", *STAGE, *options)
+    wait_for_state(tracker, segmenter, source, rig=rig_name)
+    source.kill()
+    source.wait()
+    start("source", *STAGE, *options, "--scene-rig", "endoscope")
+    for process, name in ((tracker, "tracker"), (segmenter, "segmenter")):
+        _, err = process.communicate(timeout=20)
+        assert process.returncode == 1
+        assert f"suturetrack {name}: the source has another calibration now" in err
+
+
 def test_without_a_budget_a_process_that_is_killed_ends_the_run_with_a_clear_line(
     start: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:

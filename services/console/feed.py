@@ -121,9 +121,6 @@ class Feed:
             if not self.watched.wait(_PULSE_S):
                 continue
             began = time.monotonic()
-            if self.rig is None:
-                with suppress(NoAnswer):
-                    self.rig = self.bus.ask(topics.CALIBRATION, None, timeout=1.0)
             frame = self._frames.get(_PULSE_S)
             header: dict[str, Any] = {"rig": self.bus.rig, "frame": None}
             images: tuple[bytes, ...] = ()
@@ -133,6 +130,10 @@ class Feed:
                 header |= {"frame": frame.stamp.frame, "size": [width, height]}
                 self._wait_for_states(frame.stamp.frame)
             self.deliver(picture.pack(header | self._moment(), images))
+            if frame is None or self.rig is None:
+                # A source that is started again may have another calibration.
+                with suppress(NoAnswer):
+                    self.rig = self.bus.ask(topics.CALIBRATION, None, timeout=1.0)
             self.bus.stop.wait(max(0.0, began + _PERIOD_S - time.monotonic()))
 
     def _wait_for_states(self, frame: int) -> None:
