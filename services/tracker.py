@@ -14,16 +14,18 @@ import numpy as np
 import tyro
 
 from services import topics
+from services.bus import Bus
 from services.gate import Gate
 from services.grasping import GraspDesk
 from services.seeding import SeedDesk
 from services.service import Service, ServiceConfig, Stopped, compiling
 from services.wire import scaled
+from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationConfig, InitializationError
 from suturetrack.segmentation import joined
 from suturetrack.tracking import Tracker, TrackerStep, TrackingConfig
-from suturetrack.types import RidgeField, Seed, Stamp
+from suturetrack.types import RidgeField, Seed, Stamp, ThreadState
 
 # A look in the worker thread must give way to the threads that are held at once.
 _SWITCH_INTERVAL_S = 5e-4
@@ -53,7 +55,7 @@ def run(service: Service, config: TrackerConfig) -> None:
         warm_up(rig, config)
     given = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
     if config.service.resume:
-        desk.resume(given)
+        desk.resume([*_held(bus, rig), *given])
     else:
         for seed in given:
             desk.seed(seed)
@@ -65,26 +67,31 @@ def run(service: Service, config: TrackerConfig) -> None:
     fields = bus.newest(topics.FIELD)
     service.ready()
     gate = Gate(rig, ordered=not config.service.lockstep)
+    states: tuple[ThreadState, ...] = ()
     for ridges in fields:
         refusal = gate.refusal(ridges, time.monotonic_ns())
         if refusal:
             fields.refuse(refusal)
             continue
         if gate.began_anew:
+            for state in states:
+                if state.curve is not None:
+                    tracker.resume(_seed_on(state), state)
             desk.resume(given)
         for seed in desk.take_requests(ridges.stamp):
             recorder.request(ridges.stamp, seed)
         for forget in desk.take_forgets():
             recorder.request(ridges.stamp, forget)
         step = tracker.step(ridges)
-        for state in step.states:
+        states = step.states
+        for state in states:
             bus.publish(topics.STATE, scaled(state, rig.metres_per_unit))
-        grasps.update(step.states)
+        grasps.update(states)
         published_ns = service.finished(ridges.stamp)
         for looked_in, found in _by_field(step):
             recorder.initializations(looked_in, desk.seeds, found)
-        if step.states:
-            recorder.states(step.states, published_ns)
+        if states:
+            recorder.states(states, published_ns)
         else:
             recorder.passed(ridges.stamp, published_ns)
         for looked_in, found in _by_field(step):
@@ -101,6 +108,19 @@ def _by_field(
     for looked_in in dict.fromkeys(step.looked_in.values()):
         names = [name for name, other in step.looked_in.items() if other is looked_in]
         yield looked_in, {name: step.initializations[name] for name in names}
+
+
+def _held(bus: Bus, rig: StereoRig) -> list[Seed]:
+    """A seed on each thread that was held last, for those whose own went with the source that kept it."""
+    last = (scaled(state, 1 / rig.metres_per_unit) for state in bus.last(topics.STATE))
+    return [_seed_on(state) for state in last if state.curve is not None]
+
+
+def _seed_on(state: ThreadState) -> Seed:
+    """The middle of a thread's last curve."""
+    assert state.curve is not None
+    x, y, z = nurbs.evaluate(state.curve, np.array([0.5]))[0].tolist()
+    return Seed(state.thread, point=(x, y, z))
 
 
 def warm_up(rig: StereoRig, config: TrackerConfig) -> None:

@@ -22,6 +22,7 @@ from services.service import Service, ServiceConfig
 from services.source import SourceConfig
 from services.sources import InputConfig
 from services.tracker import TrackerConfig
+from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import initialize
@@ -30,6 +31,7 @@ from suturetrack.segmentation import SegmentationConfig, Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.types import RidgeField, Seed, Stamp, Status, StereoFrame, ThreadState, Truth
+from tests.conftest import wait_until
 
 FRAMES = 8
 STAGE = InputConfig("stage:figure8-107", frames=FRAMES)
@@ -305,3 +307,34 @@ def test_a_seed_on_nothing_takes_nothing_from_a_thread_that_is_tracked() -> None
     assert [s.events[0] for s in states if "found" in s.events] == ["found"]
     assert all(s.curve is not None for s in states)
     assert states[-1].status is Status.TRACKING
+
+
+def test_a_thread_outlives_its_seed_and_the_time_in_which_it_was_found() -> None:
+    """What its seed was has gone with a source; then another source begins to count anew."""
+    scene, rig = open_scene("figure8-107"), Rig()
+    camera, before = rig.connect("source"), rig.connect("before")
+    camera.answer(topics.CALIBRATION, lambda _: scene.rig)
+    camera.keep(topics.STATE)
+    states = camera.every(topics.STATE)
+    segments = Segmenter(scene.rig)
+
+    def field(at_s: float) -> RidgeField:
+        stamp = Stamp(int(30 * at_s), int(1e9 * at_s), 0)
+        return segments.step(StereoFrame(stamp, *scene.render(0)))
+
+    tracker_before = Tracker(scene.rig)
+    tracker_before.seed(Seed("mine", pixel=scene.seed_pixel(0)))
+    last = tracker_before.step(field(0)).states[0]
+    before.publish(topics.STATE, scaled(last, scene.rig.metres_per_unit))
+    assert states.get(1) is not None
+    rig.start("tracker", tracker, TrackerConfig(ServiceConfig(resume=1)))
+    assert camera.wait_for_alive("tracker", 60)
+    found = []
+    for at_s in (100.0, 100.1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6):
+        refused = rig.buses["tracker"].refused
+        camera.publish(topics.FIELD, field(at_s))
+        wait_until(lambda n=refused: states.waiting or rig.buses["tracker"].refused > n)
+        found += [(s.stamp.frame, "found again" in s.events) for s in drain(states)]
+    rig.stop()
+    assert not rig.errors
+    assert found == [(3000, True), (3003, False), (15, True), (18, False)]
