@@ -25,7 +25,7 @@ class RecordConfig:
 
 
 def run(service: Service, config: RecordConfig) -> None:
-    """Records until stopped; raises InputError when the folder cannot be used."""
+    """Records until stopped; raises InputError when the folder cannot be used, or not any more."""
     folder = config.service.run_dir or fresh_folder()
     if folder.is_dir() and any(folder.glob("*.rrd")):
         raise InputError(f"run folder {folder} holds a run already; give another --run-dir")
@@ -41,6 +41,9 @@ def run(service: Service, config: RecordConfig) -> None:
         service.ready()
         while not service.bus.stop.is_set:
             view.step()
+            service.warning = next((r.problem for r in recorders if r.problem), "")
+            if any(recorder.fault for recorder in recorders):
+                raise InputError(service.warning)
     print(f"Open it with: suturetrack view {folder}")
 
 

@@ -100,15 +100,21 @@ class Recorder:
         self.close()
 
     @property
-    def problem(self) -> str | None:
-        """What is wrong with the recording, in words."""
+    def fault(self) -> str | None:
+        """Why nothing is recorded any more, in words."""
         if self._file is None:
             return None
         if self._file.problem is not None:
             return self._file.problem
         if self._stuck or self._is_stuck():
             return f"recording stopped: the disk is full or too slow ({self.process})"
-        return f"{self.left_out} values not recorded: the disk is slow" if self.left_out else None
+        return None
+
+    @property
+    def problem(self) -> str | None:
+        """What is wrong with the recording, in words."""
+        lacks = f"{self.left_out} values not recorded: the disk is slow" if self.left_out else None
+        return self.fault or (lacks if self._file is not None else None)
 
     def frame(self, frame: StereoFrame, published_ns: int | None = None) -> None:
         """Records both images; `published_ns` is now when not given."""

@@ -409,6 +409,23 @@ def test_a_recording_may_say_much_and_its_last_word_is_told(
         recording.stop()
 
 
+def test_a_recording_that_ended_by_itself_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "talker"
+    program.write_text("#!/bin/sh\necho 'record: the disk is full' >&2\nexit 1\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.chdir(tmp_path)
+    recording = Recording("rig", None)
+    assert not recording.problem
+    recording.start()
+    wait_until(lambda: recording.problem.endswith("failed: record: the disk is full"))
+    assert recording.folder is None
+    with pytest.raises(InputError, match="the disk is full"):
+        recording.stop()
+
+
 def test_a_source_that_comes_back_may_have_another_calibration(stage: Stage) -> None:
     stage.feed.start()
     stage.feed.watched.set()

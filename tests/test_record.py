@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,27 @@ def test_what_is_published_meanwhile_is_recorded(
     assert {"a", "b"} == {thread for _, thread in frames}
     assert found.images({frame for frame, _ in frames})
     assert load_calibration(folder / "calibration.yaml").image_size == rig.image_size
+
+
+def test_a_recording_that_cannot_go_on_ends_with_the_reason(
+    tmp_path: Path, rig: StereoRig, curve: Nurbs
+) -> None:
+    hub, folder = Hub(), tmp_path / "run"
+    speaker = Bus(hub.connect(), "rig", "tracker")
+    speaker.answer(topics.CALIBRATION, lambda _: rig)
+    config = RecordConfig(ServiceConfig(run_dir=folder))
+    service = Service("record", config.service, Bus(hub.connect(), "rig", "record"))
+    with ThreadPoolExecutor(1) as pool:
+        recording = pool.submit(record.run, service, config)
+        assert speaker.wait_for_alive("record", 30)
+        publish_frame(speaker, 0, curve, rig)
+        shutil.rmtree(folder)
+        try:
+            with pytest.raises(InputError, match="recording stopped: the file or its folder was"):
+                recording.result(30)
+        finally:
+            service.bus.close()
+    speaker.close()
 
 
 def test_a_folder_that_holds_a_run_is_refused(tmp_path: Path) -> None:

@@ -158,6 +158,7 @@ class Feed:
         if self.grasp is not None:
             name, where = self.grasp
             mark = picture.marker(judged.get(name), where, rig)
+        warnings = [f"{h.process}: {h.warning}" for h in self._health.values() if h.warning]
         return {
             "waiting": False,
             "threads": [picture.thread(one, rig) for one in judged.values()],
@@ -166,5 +167,5 @@ class Feed:
             "missed": self.client.missed,
             "rate_hz": tracker.rate_hz if tracker is not None else None,
             "latency_ms": tracker.latency.p50_ms if tracker is not None else None,
-            "warnings": [f"{h.process}: {h.warning}" for h in self._health.values() if h.warning],
+            "warnings": [*filter(None, [self.recording.problem]), *warnings],
         }

@@ -36,6 +36,12 @@ class Recording:
         child = self._child
         return self._folder if child is not None and child.poll() is None else None
 
+    @property
+    def problem(self) -> str:
+        """Why it ended by itself, in words; empty when it did not."""
+        child = self._child
+        return self._failure(child) if child is not None and child.poll() else ""
+
     def start(self) -> Path:
         """Begins to record to a new folder; raises InputError when it records already."""
         with self._lock:
@@ -77,11 +83,14 @@ class Recording:
                     child.kill()
                 self._listener.join()
             if child.returncode:
-                # Who was killed could not say why.
-                explains = self._said and child.returncode > 0
-                reason = self._said[0].strip() if explains else f"status {child.returncode}"
-                raise InputError(f"the recording to {self._folder} failed: {reason}")
+                raise InputError(self._failure(child))
             return self._folder
+
+    def _failure(self, child: subprocess.Popen[str]) -> str:
+        # Who was killed could not say why.
+        explains = self._said and child.returncode > 0
+        reason = self._said[0].strip() if explains else f"status {child.returncode}"
+        return f"the recording to {self._folder} failed: {reason}"
 
     def close(self) -> None:
         """Completes what still runs."""
