@@ -110,6 +110,8 @@ def run(config: RunConfig | DemoConfig) -> None:
         monitor = _watch(config, console, stack)
     for table in monitor.tables():
         console.print(table)
+    for warning in monitor.warnings():
+        console.print(warning, markup=False, soft_wrap=True)
     console.print(f"Open it with: suturetrack view {config.service.run_dir}")
 
 

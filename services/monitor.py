@@ -68,8 +68,11 @@ class Monitor:
             length = thread.last.length * 1000
             known = "" if np.isnan(length) else f" {length:.1f} mm"
             parts.append(f"thread {name} {thread.last.status}{known}")
-        warnings = [f"{name}: {h.warning}" for name, h in self._in_order() if h.warning]
-        return " · ".join(parts + warnings)
+        return " · ".join(parts + self.warnings())
+
+    def warnings(self) -> list[str]:
+        """What is wrong, as the processes told it last."""
+        return [f"{name}: {h.warning}" for name, h in self._in_order() if h.warning]
 
     def tables(self) -> list[Table]:
         """How the run went: the threads, and the processes."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -221,6 +222,27 @@ def test_ctrl_c_ends_a_run_with_its_table(
     assert "tracking %" in out
     assert not any(child.is_running() for child in family.values())
     assert not RunFolder(tmp_path).problems
+
+
+def test_what_was_wrong_to_the_end_is_told_with_the_table(
+    start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    run = start("run", *STAGE, "--run-dir", tmp_path / "a")
+    wait_for_state(run)
+    shutil.rmtree(tmp_path / "a")
+    bus = Bus(ZenohTransport(local_config(ServiceConfig.rig, "viewer")), "rig", "viewer")
+    stopped = "recording stopped: the file or its folder was removed"
+    told = set[str]()
+    for health in bus.every(topics.HEALTH):
+        told |= {health.process} if stopped in health.warning else set()
+        if told == PROCESSES:
+            break
+    bus.close()
+    run.send_signal(signal.SIGINT)
+    out, err = run.communicate(timeout=20)
+    assert run.returncode == 0, err
+    last_words = out[out.index("refused") :]
+    assert all(f"{name}: {stopped}" in last_words for name in PROCESSES)
 
 
 def test_processes_end_when_their_launcher_is_killed(
