@@ -132,8 +132,10 @@ class RunSummary:
 def summarize(folder: RunFolder) -> RunSummary:
     """Reads what the figures need, and no image."""
     frames = folder.series("/plots/latency_ms/**").values()
-    last = int(max((numbers.max() for numbers, _ in frames), default=0))
     found = courses(folder)
+    # Of a run that goes on, what is read later knows of later frames.
+    ends = [*(numbers.max() for numbers, _ in frames), *(course.frames[-1] for course in found)]
+    last = int(max(ends, default=0))
     about = next(iter(folder.about().values()), {})
     words = [f"suturetrack {about.get('suturetrack')}", about.get("level"), about.get("machine")]
     return RunSummary(

@@ -17,7 +17,16 @@ from services.run_folder import RunFolder
 from services.summary import RunSummary, summarize
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.types import Energies, Nurbs, Stamp, Status, StereoFrame, ThreadState, Truth
+from suturetrack.types import (
+    Energies,
+    Float64,
+    Nurbs,
+    Stamp,
+    Status,
+    StereoFrame,
+    ThreadState,
+    Truth,
+)
 
 T, HIDDEN, LOST = Status.TRACKING, Status.OCCLUDED, Status.LOST
 COURSE = [T, T, T, HIDDEN, LOST, LOST, T, T, LOST, T]
@@ -116,3 +125,19 @@ def test_the_page_holds_plots_and_key_frames_and_needs_nothing_else(
 def test_losses_before_the_first_sight_do_not_count() -> None:
     status = [LOST, LOST, T, LOST, LOST]
     assert losses([0, 1, 2, 3, 4], status) == [Loss(3, None)]
+
+
+def test_states_that_were_written_while_the_run_was_read_are_frames_of_it(
+    tmp_path: Path, rig: StereoRig, curve: Nurbs
+) -> None:
+    class Growing(RunFolder):
+        """What is plotted was read when the run had hardly begun."""
+
+        def series(self, *contents: str) -> dict[str, tuple[Float64, Float64]]:
+            read = super().series(*contents)
+            return {name: (x[:3], y[:3]) for name, (x, y) in read.items()}
+
+    record(tmp_path, rig, curve, shift_mm=0.0)
+    (thread,) = summarize(Growing(tmp_path)).threads
+    assert thread.frames == 19
+    assert sum(thread.shares.values()) + thread.skipped_share == pytest.approx(1.0)
