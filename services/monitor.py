@@ -63,7 +63,8 @@ class Monitor:
         tracker = self._health.get("tracker")
         if tracker is not None:
             parts.append(f"latency {tracker.latency.p50_ms:.0f}/{tracker.latency.p99_ms:.0f} ms")
-        parts.append(f"dropped {sum(h.dropped for h in self._lives.values())}")
+        # Those who only watch pass frames over as they like.
+        parts.append(f"dropped {sum(self._total(name, 'dropped') for name in topics.PROCESSES)}")
         for name, thread in self._threads.items():
             length = thread.last.length * 1000
             known = "" if np.isnan(length) else f" {length:.1f} mm"

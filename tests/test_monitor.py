@@ -43,3 +43,15 @@ def test_what_nothing_was_measured_of_has_no_figures(curve: Nurbs) -> None:
     assert processes[0][1:6] == ["0", "-", "-", "-", "-"]
     for bus in (here, there):
         bus.close()
+
+
+def test_what_those_pass_over_who_only_watch_is_not_dropped() -> None:
+    hub = Hub()
+    here, there = (Bus(hub.connect(), "rig", name) for name in ("run", "all"))
+    monitor = Monitor(here)
+    for process, dropped in (("segmenter", 2), ("tracker", 1), ("console", 1000)):
+        there.publish(topics.HEALTH, replace(HEALTHY, process=process, dropped=dropped))
+    monitor.listen()
+    assert " · dropped 3" in monitor.line()
+    for bus in (here, there):
+        bus.close()
