@@ -38,6 +38,8 @@ HEARTBEAT_S = 1.0
 _GRACE_S = 1.2
 """From the wish to stop until a step that takes too long is interrupted."""
 _COMPLAINT_INTERVAL_S = 1.0
+_NOTICE_S = 2.0
+"""After this time a process that waits says so in its log."""
 _CALIBRATION_S = 0.2
 """How long a source may take to tell its calibration once more."""
 _SHARING = 8
@@ -118,9 +120,15 @@ class Service:
 
     @contextmanager
     def waiting(self, process: str) -> Iterator[None]:
-        """Says in the health which process this one waits for, so that nobody takes it for hung."""
+        """Says which process this one waits for, so that nobody takes it for hung."""
         self.awaits = process
-        yield
+        notice = threading.Timer(_NOTICE_S, log.info, ("waits for the %s", process))
+        notice.daemon = True
+        notice.start()
+        try:
+            yield
+        finally:
+            notice.cancel()
         self.awaits = ""
 
     def record(self, rig: StereoRig, config: object) -> Recorder:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import shutil
 import signal
 import subprocess
@@ -277,6 +278,15 @@ def test_two_runs_at_once_keep_apart_and_a_name_is_used_once(
     assert first.wait(20) == 0
     frames = [s.state.stamp.frame for s in RunFolder(tmp_path / "c").states()]
     assert frames == list(range(FRAMES))
+
+
+def test_a_process_that_waits_says_for_whom(
+    start: Callable[..., subprocess.Popen[str]], rig_name: str
+) -> None:
+    waiting = start("record", "--rig", rig_name)
+    assert waiting.stderr is not None
+    assert select.select([waiting.stderr], [], [], 15)[0]
+    assert waiting.stderr.readline() == "record: waits for the source\n"
 
 
 def test_garbage_is_not_looked_for_in_what_a_process_has_loaded(rig_name: str) -> None:
