@@ -11,12 +11,13 @@ from contextlib import suppress
 import numpy as np
 
 from services.bus import Reader
+from services.seeding import seed_on
 from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.segmentation import Segmenter
 from suturetrack.tracking.thread import FOUND, GIVEN_UP
-from suturetrack.types import InputError, Seed, Stamp, Status, StereoFrame, ThreadState
+from suturetrack.types import InputError, Stamp, Status, StereoFrame, ThreadState
 
 _PERIOD_NS = 1_000_000_000
 """Of capture time, so that a recording adapts as the live run did."""
@@ -128,11 +129,3 @@ def follow(segmenter: Segmenter, state: ThreadState) -> None:
     if state.curve is not None and state.status is not Status.LOST:
         points = nurbs.evaluate(state.curve, _ALONG)
         segmenter.follow(state.stamp.capture_ns, points, state.thread)
-
-
-def seed_on(state: ThreadState) -> Seed:
-    """The middle of what is seen of a thread."""
-    assert state.curve is not None
-    seen = np.linspace(0, 1, len(state.seen))[state.seen]
-    x, y, z = nurbs.evaluate(state.curve, seen[len(seen) // 2 :][:1])[0]
-    return Seed(state.thread, point=(float(x), float(y), float(z)))

@@ -7,6 +7,8 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from services import topics
 from services.bus import Bus, Request
 from services.messages import Forget, Forgotten, SeedReply
@@ -16,7 +18,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.tracking import Tracker
 from suturetrack.tracking.tracker import FORGOTTEN
-from suturetrack.types import InputError, Seed, Stamp
+from suturetrack.types import InputError, Seed, Stamp, ThreadState
 
 log = logging.getLogger("suturetrack")
 _MOST_REASONS = 3
@@ -82,12 +84,21 @@ class SeedDesk:
                 "a point is in metres"
             )
 
-    def resume(self, given: Iterable[Seed]) -> None:
-        """Takes up the threads of a tracker that died: from their last states, else from their seeds."""
+    def resume(self, given: Iterable[Seed], held: Iterable[ThreadState] = ()) -> None:
+        """Takes up the threads of a tracker that died, or of another time: from their last states, else
+        from their seeds.
+
+        Args:
+            given: seeds from the start.
+            held: states of this tracker.
+        """
         to_units = 1 / self._rig.metres_per_unit
         asked = [scaled(seed, to_units) for seed in self._bus.last(topics.SEEDING)]
-        last = {state.thread: scaled(state, to_units) for state in self._bus.last(topics.STATE)}
-        for seed in {seed.thread: seed for seed in (*given, *asked)}.values():
+        heard = [scaled(state, to_units) for state in self._bus.last(topics.STATE)]
+        last = {state.thread: state for state in (*heard, *held)}
+        # A seed may have gone with the source that kept it.
+        lying = [seed_on(state) for state in last.values() if state.curve is not None]
+        for seed in {seed.thread: seed for seed in (*lying, *given, *asked)}.values():
             state = last.get(seed.thread)
             if state is not None and FORGOTTEN in state.events:
                 continue
@@ -191,6 +202,15 @@ class SeedDesk:
         candidates = tuple((float(u), float(v)) for u, v in raw)
         reason = f"{error.reason}; thread {thread} goes on as before" if is_kept else error.reason
         return SeedReply(thread, False, reason, stamp, candidates=candidates)
+
+
+def seed_on(state: ThreadState) -> Seed:
+    """The middle of what is seen of a thread's curve, or of the whole."""
+    assert state.curve is not None
+    everywhere = np.linspace(0, 1, len(state.seen))
+    shown = everywhere[state.seen] if state.seen.any() else everywhere
+    x, y, z = nurbs.evaluate(state.curve, shown[[len(shown) // 2]])[0].tolist()
+    return Seed(state.thread, point=(x, y, z))
 
 
 def _answer(case: _Case, reply: SeedReply) -> None:

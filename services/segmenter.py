@@ -10,8 +10,9 @@ import numpy as np
 import tyro
 
 from services import topics
-from services.adaptation import Adaptation, seed_on
+from services.adaptation import Adaptation
 from services.bus import Bus
+from services.seeding import seed_on
 from services.service import Service, ServiceConfig, Stopped, compiling
 from services.wire import scaled
 from suturetrack.camera import StereoRig

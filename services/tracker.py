@@ -14,13 +14,11 @@ import numpy as np
 import tyro
 
 from services import topics
-from services.bus import Bus
 from services.gate import Gate
 from services.grasping import GraspDesk
 from services.seeding import SeedDesk
 from services.service import Service, ServiceConfig, Stopped, compiling
 from services.wire import scaled
-from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationConfig, InitializationError
 from suturetrack.segmentation import joined
@@ -55,7 +53,7 @@ def run(service: Service, config: TrackerConfig) -> None:
         warm_up(rig, config)
     given = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
     if config.service.resume:
-        desk.resume([*_held(bus, rig), *given])
+        desk.resume(given)
     else:
         for seed in given:
             desk.seed(seed)
@@ -74,10 +72,7 @@ def run(service: Service, config: TrackerConfig) -> None:
             fields.refuse(refusal)
             continue
         if gate.began_anew:
-            for state in states:
-                if state.curve is not None:
-                    tracker.resume(_seed_on(state), state)
-            desk.resume(given)
+            desk.resume(given, states)
         for seed in desk.take_requests(ridges.stamp):
             recorder.request(ridges.stamp, seed)
         for forget in desk.take_forgets():
@@ -108,19 +103,6 @@ def _by_field(
     for looked_in in dict.fromkeys(step.looked_in.values()):
         names = [name for name, other in step.looked_in.items() if other is looked_in]
         yield looked_in, {name: step.initializations[name] for name in names}
-
-
-def _held(bus: Bus, rig: StereoRig) -> list[Seed]:
-    """A seed on each thread that was held last, for those whose own went with the source that kept it."""
-    last = (scaled(state, 1 / rig.metres_per_unit) for state in bus.last(topics.STATE))
-    return [_seed_on(state) for state in last if state.curve is not None]
-
-
-def _seed_on(state: ThreadState) -> Seed:
-    """The middle of a thread's last curve."""
-    assert state.curve is not None
-    x, y, z = nurbs.evaluate(state.curve, np.array([0.5]))[0].tolist()
-    return Seed(state.thread, point=(x, y, z))
 
 
 def warm_up(rig: StereoRig, config: TrackerConfig) -> None:

@@ -316,14 +316,17 @@ def test_a_thread_outlives_its_seed_and_the_time_in_which_it_was_found() -> None
     camera.answer(topics.CALIBRATION, lambda _: scene.rig)
     camera.keep(topics.STATE)
     states = camera.every(topics.STATE)
-    segments = Segmenter(scene.rig)
+    segments, seed = Segmenter(scene.rig), Seed("mine", pixel=scene.seed_pixel(0))
+
+    def frame(at_s: float) -> StereoFrame:
+        return StereoFrame(Stamp(int(30 * at_s), int(1e9 * at_s), 0), *scene.render(0))
 
     def field(at_s: float) -> RidgeField:
-        stamp = Stamp(int(30 * at_s), int(1e9 * at_s), 0)
-        return segments.step(StereoFrame(stamp, *scene.render(0)))
+        return segments.step(frame(at_s))
 
+    segments.learn(frame(0), seed)
     tracker_before = Tracker(scene.rig)
-    tracker_before.seed(Seed("mine", pixel=scene.seed_pixel(0)))
+    tracker_before.seed(seed)
     last = tracker_before.step(field(0)).states[0]
     before.publish(topics.STATE, scaled(last, scene.rig.metres_per_unit))
     assert states.get(1) is not None
