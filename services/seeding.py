@@ -171,6 +171,7 @@ class SeedDesk:
                     raise InputError(_failure(case))
                 is_kept = self._tracker.is_known(thread)
                 if not is_kept:
+                    self._tracker.forget(thread)
                     self._bus.publish(topics.DROPPED, Forget(thread))
                 _answer(case, self._not_found(thread, stamp, result, is_kept=is_kept))
             del self._cases[thread]

@@ -280,6 +280,13 @@ def test_a_tip_that_has_begun_to_fold_is_cut_off_at_the_turn(
     assert turned_round.part == pytest.approx(tail.part, abs=0.01)
 
 
+@pytest.mark.parametrize("length", [0.5, 1.0, 2.0])
+def test_a_stub_has_no_folded_ends(rig: StereoRig, length: float) -> None:
+    x = np.linspace(0, length, 50)
+    curve = curve_through(np.c_[x, 0 * x, 0 * x + 200.0])
+    assert [tail.part for tail in doubled_ends(curve, rig)] == [0.0, 0.0]
+
+
 def test_an_end_that_is_drawn_out_of_a_hole_does_not_fold() -> None:
     scene = open_scene("pull-through", 190)
     segmenter, tracker = Segmenter(scene.rig), Tracker(scene.rig)

@@ -230,10 +230,12 @@ def test_a_live_seed_is_answered(seed: tuple[tuple[float, float], ...]) -> None:
     assert good.stamp is not None
     state = next(s for s in states if s.thread == "right" and s.stamp >= good.stamp)
     forgotten = operator.ask(topics.FORGET, Forget("right"), 30)
-    last = next(s for s in states if s.events == ("forgotten",))
+    gone = (s for s in states if s.events == ("forgotten",))
+    refused, last = next(gone), next(gone)
     unknown = operator.ask(topics.FORGET, Forget("middle"), 30)
     rig.stop()
     assert (forgotten.known, unknown.known) == (True, False)
+    assert (refused.thread, refused.curve) == ("left", None)
     assert (last.thread, last.curve) == ("right", None)
     assert not outside.accepted
     assert "outside the 640x480 left image" in outside.reason
@@ -292,6 +294,9 @@ def test_a_seed_on_nothing_leaves_no_trace_once_it_is_refused() -> None:
     still = Still()
     seen = still.play(34, {1: Seed("wrong", pixel=still.LINE)})
     assert [drop.thread for drop in drain(still.drops)] == ["wrong"]
+    states = drain(still.states)
+    assert [s.stamp.frame for s in states] == [*range(1, 32)]
+    assert [s.events for s in states].index(("forgotten",)) == 30
     # Looked for in frames 1 to 30, and known to the segmenter in 2 to 30.
     assert [field == seen[0] for field in seen] == [not 2 <= i <= 30 for i in range(34)]
 

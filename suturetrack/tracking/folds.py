@@ -53,7 +53,7 @@ def _fold(curve: Nurbs, rig: StereoRig, end: int, inward: Float64) -> float:
     `inward` are parameters a pixel apart that begin at that end.
     """
     both = views_at(rig, curve, inward)
-    near, cosines = _compared(both, np.arange(_TIP))
+    near, cosines = _compared(both, np.arange(min(_TIP, len(inward))))
     tip, there = np.nonzero(near & (cosines.max(axis=0) < _OPPOSED))
     if not len(tip):
         return 0.0
