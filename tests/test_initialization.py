@@ -482,6 +482,16 @@ def test_a_thread_whose_end_lies_on_a_fainter_one_ends_there(seed: int, rig: str
     assert max(error.ends) < 1
 
 
+def test_an_end_that_one_view_shows_further_on_is_doubted() -> None:
+    """The left view has the thread turn off at a crossing, just before its end."""
+    scene = open_scene("two-threads", 1704)
+    field, start = field_and_seed(scene)
+    found = initialize(field, scene.rig, start)
+    assert max(curve_error(dense(found.curve), scene.truth(0)[0].points).ends) > 3
+    assert found.confidence < 0.5
+    assert "the right view shows the last end further on" in found.reasons
+
+
 def test_a_part_that_is_shorter_than_the_gap_before_it_may_be_something_else() -> None:
     """A highlight on the table lies where a white thread would go on."""
     scene = open_scene("two-threads", 598)

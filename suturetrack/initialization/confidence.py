@@ -21,7 +21,14 @@ from suturetrack.initialization.result import PlacedDoubts, in_words, remaining
 from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.threads import Chain
-from suturetrack.metrics import arc_lengths, coverage, nearest_index, polyline_at, polyline_length
+from suturetrack.metrics import (
+    arc_lengths,
+    coverage,
+    nearest_index,
+    polyline_at,
+    polyline_distances,
+    polyline_length,
+)
 from suturetrack.types import Float64, Int64, Nurbs
 
 AGREED = 0.95
@@ -60,6 +67,9 @@ _BEND_REACH = 8
 """Pixels on both sides of a place between which the curve bends there."""
 _NO_END = 0.4
 """What an end that neither view shows as one leaves of the confidence."""
+_FURTHER_PX, _FURTHER = 8, 0.4
+"""By how many pixels one view's thread may go on behind an end of the curve, and what more leaves of the
+confidence: of 226 right starts that were sure none had it."""
 _GRAVE = 0.53
 """What a grave doubt leaves of the confidence at most."""
 _FEW = 6
@@ -98,9 +108,18 @@ def judge(
         said = in_words(places, rig, scale, right=bool(view))
         whys = [why for _, why, _ in doubts[view]]
         reasons += [f"{w} in the {name} view at {p}" for w, p in zip(whys, said, strict=True)]
-    left, right = (_placed(view, doubts, pixels, chains) for view in (0, 1))
+    further = [_ends_further_on(line, c.pixels) for line, c in zip(pixels, chains, strict=True)]
+    left, right = (
+        (*_placed(view, doubts, pixels, chains), *((float(end), _FURTHER) for end in further[view]))
+        for view in (0, 1)
+    )
     confidence *= remaining((left, right))
     for end, ordinal in enumerate(("first", "last")):
+        reasons += [
+            f"the {name} view shows the {ordinal} end further on"
+            for name, ends in zip(("left", "right"), further, strict=True)
+            if end in ends
+        ]
         readings = [samples.ends[view][end] for view in (0, 1)]
         if any(r.at_border for r in readings):
             reasons.append(f"{ordinal} end cut by the image border")
@@ -179,6 +198,16 @@ def _placed(
             left = float(np.sqrt(rest))
         placed.append((at / (len(line) - 1), left))
     return tuple(placed)
+
+
+def _ends_further_on(line: Float64, chain: Float64) -> list[int]:
+    """The ends (0 or 1) of a curve, (k, 2) pixels, behind which a view's own thread goes on."""
+    ends = []
+    for points in (chain, chain[::-1]):
+        near = np.flatnonzero(polyline_distances(points, line) < NEAR_PX)
+        if len(near) and near[0] > _FURTHER_PX:
+            ends.append(round(nearest_index(line, points[near[0]]) / (len(line) - 1)))
+    return ends
 
 
 def _confirmed(view: int, doubts: list[list[Doubt]], lines: tuple[Float64, Float64]) -> list[Doubt]:
