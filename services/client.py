@@ -202,7 +202,7 @@ class Client:
             point: (x, y, z) instead of a pixel, m.
             area: (u, v, u, v) of two opposite corners: at the clearest ridge between them.
             laser: at the laser's spot in the newest image.
-            thread: name; a thread that has it is looked for anew.
+            thread: name; a thread that has it is held until it is found from here.
             timeout: seconds.
 
         Raises:

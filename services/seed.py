@@ -27,7 +27,7 @@ class SeedConfig:
     laser: bool = False
     """Instead, the bright spot of a laser in the image."""
     thread: str = "0"
-    """Name of the thread; one that has the name already is looked for anew."""
+    """Name of the thread; one that has the name already is held until it is found from here."""
     rig: str = "rig"
     """Name of the rig."""
     zenoh: Path | None = None
