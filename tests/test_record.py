@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -22,14 +23,23 @@ from suturetrack.types import InputError, Nurbs
 from tests.test_live import publish_frame
 
 
-def test_what_is_published_meanwhile_is_recorded(
-    tmp_path: Path, rig: StereoRig, curve: Nurbs
-) -> None:
-    hub, folder = Hub(), tmp_path / "run"
+@pytest.fixture
+def system(tmp_path: Path, rig: StereoRig) -> Iterator[tuple[Bus, Service]]:
+    """Who speaks, and who records it to `run`."""
+    hub, config = Hub(), ServiceConfig(run_dir=tmp_path / "run")
     speaker = Bus(hub.connect(), "rig", "tracker")
     speaker.answer(topics.CALIBRATION, lambda _: rig)
-    config = RecordConfig(ServiceConfig(run_dir=folder))
-    service = Service("record", config.service, Bus(hub.connect(), "rig", "record"))
+    service = Service("record", config, Bus(hub.connect(), "rig", "record"))
+    yield speaker, service
+    service.bus.close()
+    speaker.close()
+
+
+def test_what_is_published_meanwhile_is_recorded(
+    tmp_path: Path, rig: StereoRig, curve: Nurbs, system: tuple[Bus, Service]
+) -> None:
+    folder, (speaker, service) = tmp_path / "run", system
+    config = RecordConfig(service.config)
     recording = threading.Thread(target=record.run, args=(service, config), daemon=True)
     recording.start()
     assert speaker.wait_for_alive("record", 30)
@@ -39,8 +49,6 @@ def test_what_is_published_meanwhile_is_recorded(
     service.bus.stop.set()
     recording.join(30)
     assert not recording.is_alive()
-    service.bus.close()
-    speaker.close()
 
     found = RunFolder(folder)
     assert not found.problems
@@ -51,24 +59,19 @@ def test_what_is_published_meanwhile_is_recorded(
 
 
 def test_a_recording_that_cannot_go_on_ends_with_the_reason(
-    tmp_path: Path, rig: StereoRig, curve: Nurbs
+    tmp_path: Path, rig: StereoRig, curve: Nurbs, system: tuple[Bus, Service]
 ) -> None:
-    hub, folder = Hub(), tmp_path / "run"
-    speaker = Bus(hub.connect(), "rig", "tracker")
-    speaker.answer(topics.CALIBRATION, lambda _: rig)
-    config = RecordConfig(ServiceConfig(run_dir=folder))
-    service = Service("record", config.service, Bus(hub.connect(), "rig", "record"))
+    speaker, service = system
     with ThreadPoolExecutor(1) as pool:
-        recording = pool.submit(record.run, service, config)
+        recording = pool.submit(record.run, service, RecordConfig(service.config))
         assert speaker.wait_for_alive("record", 30)
         publish_frame(speaker, 0, curve, rig)
-        shutil.rmtree(folder)
+        shutil.rmtree(tmp_path / "run")
         try:
             with pytest.raises(InputError, match="recording stopped: the file or its folder was"):
                 recording.result(30)
         finally:
-            service.bus.close()
-    speaker.close()
+            service.bus.stop.set()
 
 
 def test_a_folder_that_holds_a_run_is_refused(tmp_path: Path) -> None:
