@@ -58,7 +58,7 @@ class Sureness:
         now_ns: capture time of the field.
         rig: the cameras.
         before: how sure it was of what was followed before.
-        is_known: whether it has the length of a thread that was sure.
+        is_known: whether it has the length of a thread that was sure: any sure look is enough then.
     """
 
     def __init__(
@@ -74,6 +74,8 @@ class Sureness:
         self._rig = rig
         self._begin(found, _votes(found.confidence))
         self._accused: Float64 | None = None if before is None else before._accused
+        self._single = SURE if is_known else _SINGLE
+        """Confidence of a look that needs no other."""
         enough = SURE if is_known else _AT_ONCE
         self.is_sure = found.confidence >= enough and not self._is_accused(curve)
         """Whether the curve that is followed may be called the thread."""
@@ -99,7 +101,7 @@ class Sureness:
         """Makes what was sure open again: looks have to tell."""
         if self.is_sure:
             self._accused = self._outline(curve)
-            self.is_sure, self._votes = False, _HOPELESS
+            self.is_sure, self._votes, self._single = False, _HOPELESS, _SINGLE
             self._length = 0.0
             self._looks, self._last_ns = 0, now_ns
 
@@ -157,7 +159,7 @@ class Sureness:
         elif votes > self._votes:
             self._begin(found, votes)
         is_enough = self._votes >= _ENOUGH and remaining(self._doubts) >= SURE
-        self.is_sure = is_enough or found.confidence >= _SINGLE
+        self.is_sure = is_enough or found.confidence >= self._single
 
     def _is_accused(self, curve: Nurbs) -> bool:
         """Whether it is a curve that was revoked, and has not moved."""
