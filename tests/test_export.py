@@ -125,11 +125,15 @@ def test_a_recording_that_is_cut_off_is_read_up_to_there(
             bent = nurbs.curve_from(3, curve.knots, curve.control_points + noise)
             recorder.states([make_state(bent, i)])
         unfinished = file.read_bytes()
-    file.write_bytes(unfinished[: int(share * len(unfinished))])
-    frames = [line["frame"] for line in exported(tmp_path)]
-    assert frames == list(range(len(frames)))
-    assert 0.5 * share < len(frames) / 200 < 1
-    assert "tracker.rrd is cut off" in capsys.readouterr().err
+    said = []
+    # One of the two places is not where a message ends, which a file may well do.
+    for place in (int(share * len(unfinished)), int(share * len(unfinished)) - 100):
+        file.write_bytes(unfinished[:place])
+        frames = [line["frame"] for line in exported(tmp_path)]
+        assert frames == list(range(len(frames)))
+        assert 0.5 * share < len(frames) / 200 < 1
+        said.append("tracker.rrd is cut off" in capsys.readouterr().err)
+    assert any(said)
 
 
 def test_what_cannot_be_exported_is_said_in_one_line(tmp_path: Path, rig: StereoRig) -> None:
