@@ -696,6 +696,26 @@ def test_a_thread_along_the_epipolar_lines_is_not_relied_on(rig: StereoRig) -> N
     assert any("uncertain depth" in reason for reason in found.reasons)
 
 
+def test_the_depth_of_a_thread_between_two_ends_that_are_seen_is_not_relied_on() -> None:
+    """It runs along the epipolar lines: both ends are right, and places between them 2 mm off."""
+    scene = open_scene("pull-through", 1800)
+    field, seed = field_and_seed(scene)
+    found = initialize(field, scene.rig, seed)
+    assert found.confidence < 0.5
+    assert any("uncertain depth" in reason for reason in found.reasons)
+
+
+@pytest.mark.parametrize(("scenario", "seed"), [("fast", 1827), ("pull-through", 1824)])
+def test_the_two_views_of_an_end_tell_its_depth(scenario: str, seed: int) -> None:
+    """Along an epipolar line, where the crests do not, before cameras as close together as an endoscope's."""
+    scene = open_scene(scenario, seed, "endoscope")
+    field, start = field_and_seed(scene)
+    found = initialize(field, scene.rig, start)
+    truth = scene.truth(0)[0].points
+    ends = curve_error(dense(found.curve), truth).ends
+    assert max(ends) * 1000 * scene.rig.metres_per_unit < 0.8
+
+
 def test_an_end_along_an_epipolar_line_keeps_its_depth_on_few_knots() -> None:
     """As the first end of thread 1 in this scene."""
     scene = open_scene("two-threads", 940)

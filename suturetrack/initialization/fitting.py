@@ -81,8 +81,11 @@ class _Fit:
 
 
 def deviations(curve: Nurbs, samples: Samples, stiffness: Float64) -> Float64:
-    """(k,) standard deviations of the samples in space, by the noise of the crests."""
-    data, _ = _image_equations(curve, samples)
+    """(k,) standard deviations of the samples in space, by the noise of the crests.
+
+    What the ends tell is not in it: the depth of a thread between them would seem known as well.
+    """
+    data, _ = _crest_equations(curve, samples)
     across, deep = _bending_equations(curve, samples)
     factor = data / samples.variance + stiffness[0] * across + stiffness[1] * deep
     if not spline.factorize(factor):
@@ -142,10 +145,7 @@ def _slip_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, float, flo
 
 def _image_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, Float64]:
     """Rows that draw the curve onto the crests, and its ends along itself to those of the thread."""
-    views = zip(samples.crests, samples.crest_rows(), strict=True)
-    pull = sum((c.trust * c.offsets)[:, None] * rows for c, rows in views)
-    information = samples.crest_information() + samples.rest_information()
-    band, gradient = _rows(curve, samples, 0, information, np.asarray(pull))
+    band, gradient = _crest_equations(curve, samples)
     for end, (information, pull) in enumerate(zip(*samples.end_equations(), strict=True)):
         at = (len(gradient) - 3) * end
         gradient[at : at + 3] += pull
@@ -153,6 +153,14 @@ def _image_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, Float64]:
             for b in range(a + 1):
                 band[at + a, a - b] += information[a, b]
     return band, gradient
+
+
+def _crest_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, Float64]:
+    """Rows that draw the curve onto the crests."""
+    views = zip(samples.crests, samples.crest_rows(), strict=True)
+    pull = sum((c.trust * c.offsets)[:, None] * rows for c, rows in views)
+    information = samples.crest_information() + samples.rest_information()
+    return _rows(curve, samples, 0, information, np.asarray(pull))
 
 
 def _bending_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, Float64]:

@@ -22,7 +22,9 @@ _STAY = 0.01
 """Weight, against that of a crest, which keeps samples from sliding along the thread."""
 _UNSEEN = 0.02
 """Trust in a crest below which a view does not see the thread."""
-_END_NOISE_PX = 0.2
+_END_NOISE_PX = 0.1
+"""By how much a view shows an end elsewhere than the other one does, px (standard deviation); where both err
+alike, as by how far the ridge's filter reaches, the depth is none the worse."""
 _LARGEST_END_STEP_PX = 2.0
 _BEND_SAMPLES = 8.0
 """Samples over which the visible bending is averaged."""
