@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import erfc
 
+from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.metrics import polyline_length
-from suturetrack.types import RidgeField, Stamp
+from suturetrack.metrics import arc_lengths, polyline_length
+from suturetrack.types import Nurbs, RidgeField, Stamp
 
 WIDTH_PX = 1.5
 FPS = 30
@@ -38,6 +39,13 @@ def thread(
     )
     points = np.r_[np.zeros((1, 3)), np.cumsum(step, axis=0)]
     return points * (length / polyline_length(points)) + [-0.22 * length - 5, -10.0, depth]
+
+
+def curve_through(points: np.ndarray, spans: int = 24) -> Nurbs:
+    """A cubic curve on (m, 3) points, parametrised like their arc length."""
+    travelled = arc_lengths(points)
+    knots = nurbs.clamped_knots(np.linspace(0, 1, spans + 1)[1:-1], 3)
+    return nurbs.fit(points, travelled / travelled[-1], knots, 3)
 
 
 def paint(

@@ -14,7 +14,7 @@ from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.reliability import Evidence
 from suturetrack.tracking.strands import NOBODY, Neighbours
 from suturetrack.types import Nurbs
-from tests.painting import paint
+from tests.painting import curve_through, paint
 
 THREAD = np.c_[np.linspace(-40, 40, 800), np.zeros(800), np.full(800, 200.0)]
 BESIDE = (
@@ -24,12 +24,6 @@ BESIDE = (
     ]
 )
 """Crosses it twice in both images, 30 px to either side of its middle, and is deeper in between."""
-
-
-def through(points: np.ndarray) -> Nurbs:
-    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    knots = nurbs.clamped_knots(np.linspace(0, 1, 15)[1:-1], 3)
-    return nurbs.fit(points, travelled / travelled[-1], knots, 3)
 
 
 def away(curve: Nurbs, points: np.ndarray) -> float:
@@ -56,7 +50,7 @@ def known(length: float) -> KnownLength:
 def detour(fitted: Fitted) -> Nurbs:
     """The curve that changes over to the other thread between the crossings, as it settles there."""
     between = np.abs(THREAD[:, 0]) < 15.2
-    evidence = fitted(through(np.where(between[:, None], BESIDE, THREAD)), NOBODY)
+    evidence = fitted(curve_through(np.where(between[:, None], BESIDE, THREAD), 14), NOBODY)
     assert evidence.seen.all()
     assert away(evidence.fit.curve, THREAD) > 3.0
     return evidence.fit.curve
@@ -72,7 +66,7 @@ def test_a_curve_that_has_changed_over_to_another_thread_is_led_back(
 
 
 def test_a_curve_on_its_own_thread_stays_there(rig: StereoRig, fitted: Fitted) -> None:
-    own = fitted(through(THREAD), NOBODY).fit.curve
+    own = fitted(curve_through(THREAD, 14), NOBODY).fit.curve
     assert led_back(own, known(80.0), rig, NOBODY, fitted) is None
 
 

@@ -14,17 +14,11 @@ from suturetrack.tracking.energies import measure_levels
 from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import KnownLength
-from suturetrack.types import Nurbs, Seed, Stamp, StereoFrame
-from tests.painting import paint
+from suturetrack.types import Seed, Stamp, StereoFrame
+from tests.painting import curve_through, paint
 
 FRAME_NS = 33_000_000
 PIXEL = 0.0025
-
-
-def curve_through(points: np.ndarray) -> Nurbs:
-    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    knots = nurbs.clamped_knots(np.linspace(0, 1, 25)[1:-1], 3)
-    return nurbs.fit(points, travelled / travelled[-1], knots, 3)
 
 
 def step_at(offset_px: float) -> EndStep:

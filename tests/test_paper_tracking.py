@@ -11,17 +11,11 @@ from suturetrack.tracking import Tracker, TrackingConfig, paper
 from suturetrack.tracking.config import PaperConfig
 from suturetrack.tracking.spacing import evenly, respace
 from suturetrack.types import Float64, Nurbs, RidgeField, Seed, Status
-from tests.painting import paint, thread
+from tests.painting import curve_through, paint, thread
 
 PX_MM = 0.25
 LEVEL = 0.8
 CUTOFFS = (LEVEL / 2, LEVEL / 2)
-
-
-def curve_on(points: Float64, spans: int = 20) -> Nurbs:
-    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    knots = nurbs.clamped_knots(np.linspace(0, 1, spans + 1)[1:-1], 3)
-    return nurbs.fit(points, travelled / travelled[-1], knots, 3)
 
 
 def along(points: Float64, start_mm: float, stop_mm: float) -> Float64:
@@ -48,7 +42,7 @@ def test_forces_bring_both_ends_to_the_thread(rig: StereoRig, by_mm: float) -> N
     whole = thread(0.4)
     truth = along(whole, 10.0, 90.0)
     field = paint(rig, [truth], 0, strength=LEVEL)
-    start = curve_on(along(whole, 10.0 - by_mm, 90.0 + by_mm))
+    start = curve_through(along(whole, 10.0 - by_mm, 90.0 + by_mm), 20)
     assert ends_mm(start, truth).min() > 0.9 * abs(by_mm)
     assert ends_mm(fitted(start, field, rig, 2), truth).max() < 0.4
 
@@ -58,7 +52,7 @@ def test_ends_far_from_the_slope_are_searched_for(rig: StereoRig, by_mm: float) 
     whole = thread(0.4)
     truth = along(whole, 10.0, 90.0)
     field = paint(rig, [truth], 0, strength=LEVEL)
-    start = curve_on(along(whole, 10.0 - by_mm, 90.0 + by_mm))
+    start = curve_through(along(whole, 10.0 - by_mm, 90.0 + by_mm), 20)
     blind = PaperConfig(flat_slope=0.0)
     stuck = paper.fit(start, field, rig, CUTOFFS, blind)
     assert ends_mm(stuck, truth).max() > 0.5 * abs(by_mm), "forces alone would do"
@@ -75,8 +69,8 @@ def test_an_end_along_the_epipolar_lines_mends_its_depth(rig: StereoRig) -> None
     truth = np.stack([x, bend, np.full_like(x, 200.0)], axis=1)
     off = truth.copy()
     off[:, 2] += 3.0 * np.clip((x - 15.0) / 15.0, 0.0, 1.0)
-    curve = fitted(curve_on(off), paint(rig, [truth], 0, strength=LEVEL), rig, 4)
-    assert ends_mm(curve_on(off), truth).max() > 2.9
+    curve = fitted(curve_through(off, 20), paint(rig, [truth], 0, strength=LEVEL), rig, 4)
+    assert ends_mm(curve_through(off, 20), truth).max() > 2.9
     assert ends_mm(curve, truth).max() < 0.7
 
 
@@ -110,7 +104,7 @@ def test_a_thread_pulled_in_and_drawn_out_keeps_its_control_points_apart(rig: St
 
 
 def test_spacing_evenly_leaves_the_shape_and_the_ends(rig: StereoRig) -> None:
-    curve = curve_on(thread(0.0))
+    curve = curve_through(thread(0.0), 20)
     crowded = curve
     for s in (0.01, 0.013, 0.5, 0.501, 0.99):
         crowded = nurbs.insert_knot(crowded, s)

@@ -15,8 +15,8 @@ from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
 from suturetrack.tracking.strangers import Strangers
-from suturetrack.types import Nurbs, RidgeField, Seed, Status
-from tests.painting import FPS, paint
+from suturetrack.types import RidgeField, Seed, Status
+from tests.painting import FPS, curve_through, paint
 
 LEVELS = (0.8, 0.8)
 SECONDS = 2.0
@@ -27,11 +27,6 @@ def line(bulge: float = 0.0) -> np.ndarray:
     """(400, 3) points, 200 away: straight at both ends, with a bulge between."""
     arc = bulge * np.cos(0.75 * np.pi * np.clip(T, -2 / 3, 2 / 3)) ** 2
     return np.c_[arc, 30 * T, np.full(400, 200.0)]
-
-
-def curve_through(points: np.ndarray) -> Nurbs:
-    knots = nurbs.clamped_knots(np.linspace(0, 1, 24)[1:-1], 3)
-    return nurbs.fit(points, np.linspace(0, 1, len(points)), knots, 3)
 
 
 def fields(rig: StereoRig, *motions: tuple[float, float]) -> list[RidgeField]:

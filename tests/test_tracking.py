@@ -16,6 +16,7 @@ from suturetrack.initialization import Initialization, initialize
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.control_points import rearrange, refit
 from suturetrack.tracking.drift import Drift
+from suturetrack.tracking.energies import measure_levels
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.gauss_newton import expected
 from suturetrack.tracking.images import Images
@@ -23,7 +24,7 @@ from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Evidence
 from suturetrack.tracking.sampling import Samples
 from suturetrack.types import Nurbs, RidgeField, Seed, Status, ThreadState
 from tests.conftest import make_rig
-from tests.painting import FPS, paint, stamp, thread
+from tests.painting import FPS, curve_through, paint, stamp, thread
 
 
 def seed_on(rig: StereoRig, points: np.ndarray, name: str = "0") -> Seed:
@@ -214,6 +215,48 @@ def test_a_stretch_keeps_its_depth_while_it_runs_along_an_epipolar_line(
         if state.curve is not None
     ]
     assert max(off) < 0.65
+
+
+def bowed(relief: float, degrees: float) -> np.ndarray:
+    """(800, 3) points of a thread, turned by so much, whose middle bows towards or away from the cameras."""
+    x, angle = np.linspace(-25, 25, 800), np.radians(degrees)
+    steep = 1.6 * np.sign(x) * np.log1p(np.exp((np.abs(x) - 10) / 2))
+    depth = 200 + relief * np.cos(np.pi / 2 * np.clip(x / 10, -1, 1)) ** 2
+    across, along = np.cos(angle), np.sin(angle)
+    return np.c_[x * across - steep * along, x * along + steep * across, depth]
+
+
+@pytest.mark.parametrize("relief", [2.5, -2.5])
+def test_a_known_length_tells_how_far_a_stretch_along_an_epipolar_line_bows(
+    rig: StereoRig, relief: float
+) -> None:
+    truth, guess = bowed(relief, 0), curve_through(bowed(relief / 2, 0))
+    field = paint(rig, [truth], 0, noise=0.0)
+    images = Images(field, rig, measure_levels(guess, field, rig))
+
+    def fitted(length: float | None) -> float:
+        curve, _, _ = rearrange(guess, rig)
+        for _ in range(8):
+            curve = gauss_newton.fit(
+                curve, curve, images, 5.0, TrackingConfig(), known_length=length
+            ).curve
+        return metrics.curve_error(nurbs.evaluate(curve, np.linspace(0, 1, 400)), truth).rms
+
+    assert fitted(None) > 0.25
+    assert fitted(metrics.polyline_length(truth)) < 0.1
+
+
+@pytest.mark.parametrize("relief", [2.5, -2.5])
+def test_a_thread_keeps_its_length_while_its_middle_runs_along_an_epipolar_line(
+    rig: StereoRig, relief: float
+) -> None:
+    degrees = 25 * np.r_[np.ones(30), np.cos(np.pi / 2 * np.linspace(0, 1, 30)), np.zeros(60)]
+    truths = [bowed(relief, turned) for turned in degrees]
+    fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    assert all(state.status is Status.TRACKING for state in states)
+    off = [error(state, points).rms for state, points in zip(states, truths, strict=True)]
+    assert max(off) < 0.4
 
 
 def test_a_straight_thread_is_not_called_tracking_while_no_depth_of_it_is_told(

@@ -25,6 +25,7 @@ def fit_widely(
     share: float,
     config: TrackingConfig,
     neighbours: Neighbours,
+    known_length: float | None,
 ) -> Evidence:
     """Looks further away for what was seen before, and now and then for what is hidden.
 
@@ -35,10 +36,12 @@ def fit_widely(
         share: what was seen of it in the last field.
         config: how far is looked.
         neighbours: other threads that the images show.
+        known_length: of the thread, if it is known and all of it is in sight.
     """
 
     def fitted(start: Nurbs, reach_px: float) -> Evidence:
-        return Evidence.of(gauss_newton.fit(before, start, images, reach_px, config, neighbours))
+        fit = gauss_newton.fit(before, start, images, reach_px, config, neighbours, known_length)
+        return Evidence.of(fit)
 
     best = fitted(predicted, config.search_px)
     usual = 1.0 if images.field.stamp.frame % _RETRY == 0 else share - _DROP

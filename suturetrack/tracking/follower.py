@@ -97,6 +97,7 @@ class Follower:
         self.is_crowded = self.makes_detour = False
         """Whether other ridges run beside the thread, and whether they have made the curve too long or
         too short."""
+        self._is_clear = False
         self._comes_in = False
         """Whether the thread has been coming into the images since it was cut by their border."""
         self._leaps: Bool = np.zeros(2, bool)
@@ -217,7 +218,8 @@ class Follower:
     def _status(self, evidence: Evidence, plain: Bool, uncertain_s: float) -> Status:
         """The status; a curve that was lost must have its length again, and be seen, to be held."""
         model, known, noise = self.model, self.known_length, evidence.length_noise
-        length, is_clear = length_of(model.curve), evidence.is_clear(plain)
+        length = length_of(model.curve)
+        self._is_clear = is_clear = evidence.is_clear(plain)
         last = length_of(self.last_good)
         is_another = known.is_another(length, last, noise, is_clear=is_clear)
         self.is_crowded = bool(evidence.alone.mean() <= _ALL)
@@ -295,6 +297,7 @@ class Follower:
             self._share_seen,
             self.config,
             neighbours.shown_in(images),
+            self._own_length(),
         )
         self._share_seen = best.share
         # What was just drawn out may have been drawn out in depth.
@@ -307,6 +310,12 @@ class Follower:
         self._cut_doubled_ends()
         model.curve, inserted, removed = rearrange(model.curve, self.rig)
         return best, inserted, removed
+
+    def _own_length(self) -> float | None:
+        """The thread's own length, where it was last seen from end to end and lay alone."""
+        ends = self.model.ends
+        is_told = self._is_clear and ends.settled and all(ends.seen) and not ends.at_border
+        return ends.length if is_told else None
 
     def _learn_motion(self, before: Nurbs, evidence: Evidence, seconds: float) -> None:
         """An end that comes into sight does not move as fast as it is drawn out."""

@@ -45,6 +45,8 @@ _EVEN = 150.0
 # A thread that moves so far across itself between two fields is smeared to half its response.
 _SMEARED_PX = 6.5
 _LEAST_FADING = 0.25
+# How well a known length is known, as a share of it, and what is further off is not that of the thread.
+_LENGTH_DOUBT, _LENGTH_OUTLIER = 0.0015, 0.005
 # What the views show differently at an end for other reasons than its depth, such as a hole.
 _TIP_PX = 1.5
 
@@ -107,6 +109,7 @@ def fit(
     reach_px: float,
     config: TrackingConfig,
     neighbours: Neighbours = NOBODY,
+    known_length: float | None = None,
 ) -> Fit:
     """Moves the predicted curve onto the field.
 
@@ -115,6 +118,7 @@ def fit(
         predicted: cubic, parametrised like its arc length.
         reach_px: how far along the normals the thread is looked for at first.
         neighbours: other threads that the field shows.
+        known_length: of the thread, if it is known and all of it is in sight.
     """
     samples = Samples.of(predicted.knots, config.samples_per_span)
     reference = _Reference.of(samples, predicted)
@@ -130,7 +134,10 @@ def fit(
         surprise = linear.surprise(crowd) if surprise is None else surprise
         equations = linear.equations(reference, faded, config, outlier, crowd, surprise)
         equations.add_tips(tips, predicted.control_points - control_points)
-        control_points = control_points + equations.solve()
+        step = equations.solve()
+        if known_length is not None:
+            step = linear.keeping_length(step, equations, known_length)
+        control_points = control_points + step
         outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
         reach = max(reach / 2, _REFINED_PX)
     curve = curve_from(spline.DEGREE, predicted.knots, control_points)
@@ -290,7 +297,7 @@ class _Linearized:
 
         So lengths stay where they were, which tells the depth of stretches along the epipolar lines. Where
         the prediction has failed, and at the ends, which each field draws out anew, little bending and an
-        even speed are all there is to ask for. No length is: noise in depth only ever adds to it, and a
+        even speed are all there is to ask for. No speed is: noise in depth only ever adds to it, and a
         goal taken from the curve would keep what it adds.
         """
         speed = reference.speed
@@ -301,6 +308,23 @@ class _Linearized:
         kept *= np.clip(np.minimum(along, along[-1] - along) / _FREE_PX, 0.0, 1.0)
         goal = kept[:, None] * reference.second - self.second
         return rows.shape_rows(self.first, goal, bending, stretch)
+
+    def keeping_length(self, step: Float64, equations: _Equations, known: float) -> Float64:
+        """The step with a last row, for the length of the whole.
+
+        It tells how far stretches along the epipolar lines bow, of which the images show nothing. It is of
+        the length that bends make: where the ends are is found elsewhere.
+        """
+        speed = _norm(self.first)
+        length = float(np.sum(self.samples.share * speed))
+        tangents = self.first / speed[:, None]
+        row = self.samples.gather(self.samples.share[:, None] * tangents, 1)
+        lacking = known - length - float(np.sum(row * step))
+        row[0] += tangents[0]
+        row[-1] -= tangents[-1]
+        moved = equations.solve_for(row)
+        doubt = _LENGTH_DOUBT * known * (1 + (lacking / (_LENGTH_OUTLIER * known)) ** 2)
+        return step + lacking / (doubt**2 + float(np.sum(row * moved))) * moved
 
     def surprise(self, crowd: Crowd) -> Float64:
         """(k,) px by which the thread has left the curve where it is alone, and so in between."""
@@ -341,7 +365,11 @@ class _Equations:
     def solve(self) -> Float64:
         """(n + 1, 3) step; leaves the factor in the band."""
         spline.factorize(self.band)
-        return spline.solve_factorized(self.band, self.gradient).reshape(-1, 3)
+        return self.solve_for(self.gradient)
+
+    def solve_for(self, right: Float64) -> Float64:
+        """(n + 1, 3) step for another right-hand side, after `solve`."""
+        return spline.solve_factorized(self.band, right.reshape(-1)).reshape(-1, 3)
 
     def covariance(self, samples: Samples) -> Float64:
         """(k, 3, 3) of the samples, after `solve`."""

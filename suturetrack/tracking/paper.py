@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import search, spline
+from suturetrack.kernels import search
 from suturetrack.metrics import arc_lengths
 from suturetrack.nurbs import curve_from, evenly_spaced
 from suturetrack.tracking.config import PaperConfig
@@ -53,12 +53,12 @@ def fit(
     """
     count = config.samples_per_control_point * len(curve.control_points)
     samples = Samples.at(curve.knots, evenly_spaced(curve, count))
-    sums = spline.gather(samples.first, samples.table[0], np.ones((count, 1)))
+    sums = samples.gather(np.ones((count, 1)))
     control_points = curve.control_points
     nearest = [_gap(control_points, end) / 3 for end in (0, -1)]
     for _ in range(config.iterations):
         step = _point_offsets(samples, control_points, field, rig, cutoffs, config)
-        change = spline.gather(samples.first, samples.table[0], step) / np.maximum(sums, 1e-9)
+        change = samples.gather(step) / np.maximum(sums, 1e-9)
         for end, least in zip((0, -1), nearest, strict=True):
             change[end] = _short_of(step[end], control_points, end, least)
         control_points = control_points + change

@@ -39,6 +39,10 @@ class Samples:
         """(k, dim) points, or derivatives, for (n + 1, dim) control points."""
         return spline.combine(self.first, self.table[times], control_points)
 
+    def gather(self, points: Float64, times: int = 0) -> Float64:
+        """(n + 1, dim) sums of (k, dim) samples at the control points: the transpose of `values`."""
+        return spline.gather(self.first, self.table[times], points)
+
     def views(self, rig: StereoRig, control_points: Float64) -> tuple[View, View]:
         """The samples in both images, for (n + 1, 3) control points."""
         return views(rig, self.values(control_points), self.values(control_points, 1))
