@@ -52,6 +52,25 @@ def test_ends_are_found_without_bias_in_what_the_filter_shows() -> None:
     assert abs(np.mean(offsets)) < 0.2
 
 
+@pytest.mark.parametrize(("wide_px", "widens"), [(0.0, False), (2.0, False), (12.0, True)])
+def test_something_wider_that_goes_on_behind_an_end_is_told_from_a_hole(
+    rig: StereoRig, wide_px: float, widens: bool
+) -> None:
+    pixel = 200.0 / rig.focal
+    truth = np.linspace([-20.0, -10.0, 200.0], [20.0, 10.0, 200.0], 200)
+    along = (truth[-1] - truth[0]) / np.linalg.norm(truth[-1] - truth[0])
+    across = np.array([-along[1], along[0], 0.0])
+    wide = truth[-1] + np.linspace(0.0, wide_px * pixel, 20)[:, None] * along
+    bundle = [wide + aside * pixel * across for aside in (-2.0, 0.0, 2.0)] if wide_px else []
+    field = paint(rig, [truth, *bundle], 0, noise=0.0)
+    curve = curve_through(truth)
+    images = Images(field, rig, measure_levels(curve, field, rig))
+    start, stop = (find_end(curve, end, images) for end in (0, 1))
+    assert start is not None
+    assert stop is not None
+    assert (start.widens, stop.widens) == (False, widens)
+
+
 def along_a_row(rig: StereoRig, depths: tuple[float, float]) -> np.ndarray:
     """(200, 3) points of a thread along a row of the left image, with these depths at its ends."""
     across = np.array([0.0, 0.25]) * depths
@@ -116,6 +135,17 @@ def test_a_thread_is_drawn_out_steadily_and_not_in_leaps(ahead_px: float, grown:
         now += FRAME_NS
         length *= 1 + sum(watch.moves(step_at(0.0), step_at(ahead_px), length, now))
     assert length == pytest.approx(grown, abs=1.0)
+
+
+@pytest.mark.parametrize("fields", [0, 40])
+def test_a_thread_is_not_drawn_out_along_something_wider(fields: int) -> None:
+    watch, length, now = EndWatch(100.0, 0), 100.0, 0
+    for i in range(fields + 40):
+        now += FRAME_NS
+        ahead = replace(step_at(0.0 if i < fields else 1.0), widens=i >= fields)
+        moves = watch.moves(step_at(0.0), ahead, length, now, is_known=True)
+        length *= 1 + sum(moves)
+    assert length == pytest.approx(100.0)
 
 
 @pytest.mark.parametrize("ahead_px", [5.0, 10.0])

@@ -57,7 +57,7 @@ def read_end(field: Float32, pixels: Float64) -> EndReading:
         return EndReading(np.nan, _leaves(pixels[0] + _OUTSIDE_PX * outward, field))
     offset = _falls_below(x, response, int(below[0]), level)
     narrow = response * narrowness(field, places, tangents, x)
-    offset = before_a_hole(x, narrow, level, offset)
+    offset = before_a_hole(widens_at(x, narrow, level), offset)
     if _leaves(pixels[0] + offset * outward, field):
         return EndReading(np.nan, True)
     return EndReading(offset, False)
@@ -79,20 +79,25 @@ def narrowness(field: Float32, pixels: Float64, tangents: Float64, x: Float64) -
     return single(spread, float(np.median(alone))) if len(alone) else np.ones(len(x))
 
 
-def before_a_hole(x: Float64, narrow: Float64, level: float, end: float) -> float:
-    """The end, or where the thread goes into something wider just before it.
+def widens_at(x: Float64, narrow: Float64, level: float) -> float:
+    """Where the ridge becomes wider than the thread for good, or ends; infinite beyond `x`.
 
     Args:
         x: (k,) px along the thread and beyond it, evenly spaced.
         narrow: (k,) responses, low where the ridge is wider than the thread.
         level: response at which the thread ends.
-        end: where all of the ridge ends.
     """
     shown = np.flatnonzero(narrow >= level)
-    if len(shown) == 0 or shown[-1] + 1 == len(x):
-        return end
-    hole = _falls_below(x, narrow, int(shown[-1]) + 1, level)
-    return hole if end - _HOLE_PX <= hole < end else end
+    if len(shown) == 0:
+        return -np.inf
+    if shown[-1] + 1 == len(x):
+        return np.inf
+    return _falls_below(x, narrow, int(shown[-1]) + 1, level)
+
+
+def before_a_hole(widens: float, end: float) -> float:
+    """The end of all of the ridge, or where it `widens` just before: the thread goes into something."""
+    return widens if end - _HOLE_PX <= widens < end else end
 
 
 def _falls_below(x: Float64, response: Float64, k: int, level: float) -> float:

@@ -11,8 +11,8 @@ from suturetrack.tracking.ends import EndStep
 # What the length of a thread may change by from one field to the next.
 _DRAWN_PX = 6.0
 # A thread is drawn out steadily: an end that leaps on by more than the first has met a tool. It makes the
-# thread longer than it ever was by no more than the second, until it has insisted for so long; for twice as
-# long as the length was steady, while that is not known.
+# thread longer than it ever was by no more than the second, or not at all along something wider, until it has
+# insisted for so long; for twice as long as the length was steady, while that is not known.
 _LEAP_PX, _LONGER_PX, _INSISTS_S = 2.5, 1.5, 5.0
 # An end that is hidden steps off by at least this much before the curve's own.
 _CUT_PX = 3.0
@@ -31,10 +31,10 @@ class EndWatch:
     What one end loses and the other gains is the thread sliding along itself. A thread that is
     suddenly shorter at an end is hidden there, one that is suddenly longer than it ever was has met
     something that looks like it: its length is then held for a while, the more firmly the longer it
-    was steady. An end that leaps on without growing so much is held as well, for fear of a tool that
-    it runs on along; not for long where the length was not steady for long, for then something has
-    come out of hiding. An end beside which another ridge runs makes good what is lacking, and gives back
-    what is too much.
+    was steady. An end that leaps on without growing so much, or goes on where the ridge is wider, is held
+    as well, for fear of a tool that it runs on along; not for long where the length was not steady for
+    long, for then something has come out of hiding. An end beside which another ridge runs makes good what
+    is lacking, and gives back what is too much.
 
     Args:
         length: of the thread now.
@@ -125,20 +125,19 @@ class EndWatch:
         shown = [step for step in steps if step]
         if doubted or any(step.at_border for step in shown):
             return doubted
-        if (now_ns - self._found_ns) * _NS < _SETTLING_S:
-            return []
+        is_new = (now_ns - self._found_ns) * _NS < _SETTLING_S
         unseen_s = [(now_ns - seen_ns) * _NS for seen_ns in self._seen_ns]
         pixel = max(step.pixel for step in shown) * length
         total = length * (1.0 + sum(offsets))
         longer = int(np.argmax(offsets))
         steady_s = (now_ns - self._steady_ns) * _NS
         insists_s = _INSISTS_S if self._is_known else max(2 * steady_s, _SETTLING_S)
-        growth = _LONGER_PX if shown[longer].offset_px > _LEAP_PX else _DRAWN_PX
-        if (
-            unseen_s[longer] < insists_s
-            and total > max(self.length, self._longest, self._before) + growth * pixel
-        ):
+        is_held = unseen_s[longer] < insists_s and (shown[longer].widens or not is_new)
+        most = max(self.length, self._longest, self._before) + _growth_px(shown[longer]) * pixel
+        if is_held and total > most:
             return [longer]
+        if is_new:
+            return []
         if total < self.length - _DRAWN_PX * pixel:
             doubted = [
                 end
@@ -164,3 +163,10 @@ class EndWatch:
     def _fading(self, now_ns: int) -> float:
         """What is left of what was remembered at the last field."""
         return math.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)
+
+
+def _growth_px(step: EndStep) -> float:
+    """By how much a step may make the thread longer than it ever was."""
+    if step.widens:
+        return 0.0
+    return _LONGER_PX if step.offset_px > _LEAP_PX else _DRAWN_PX

@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter1d
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization.ends import before_a_hole, narrowness
+from suturetrack.initialization.ends import before_a_hole, narrowness, widens_at
 from suturetrack.kernels.boundary import outer_boundary
 from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import View, derivatives_at, distinct, views, views_at
@@ -42,6 +42,8 @@ class EndStep:
     """Whether no other ridge runs beside the end, which it could run on along."""
     on_another: bool = False
     """Whether another thread is known to lie there: what goes on beyond the end may be that one."""
+    widens: bool = False
+    """Whether the ridge is wider there than the thread, and no hole: it may be a tool's."""
 
     @property
     def offset(self) -> float:
@@ -76,9 +78,10 @@ def find_end(
     found, level = outer_boundary(x, mean, np.minimum(_smooth(least) + 0.15, mean))
     if math.isnan(found):
         return None
-    boundary = before_a_hole(x, alone, level, found)
+    widens = widens_at(x, alone, level)
+    boundary = before_a_hole(widens, found)
     at_border = not inside.all() and boundary > x[-1] - 3
-    return EndStep(boundary, 1 / scale, at_border)
+    return EndStep(boundary, 1 / scale, at_border, widens=widens < boundary)
 
 
 def end_shift(
