@@ -250,7 +250,7 @@ def test_a_known_length_tells_how_far_a_stretch_along_an_epipolar_line_bows(
 def test_a_thread_keeps_its_length_while_its_middle_runs_along_an_epipolar_line(
     rig: StereoRig, relief: float
 ) -> None:
-    degrees = 25 * np.r_[np.ones(30), np.cos(np.pi / 2 * np.linspace(0, 1, 30)), np.zeros(60)]
+    degrees = 25 * np.r_[np.ones(60), np.cos(np.pi / 2 * np.linspace(0, 1, 30)), np.zeros(60)]
     truths = [bowed(relief, turned) for turned in degrees]
     fields = [paint(rig, [points], i) for i, points in enumerate(truths)]
     states = follow(fields, rig, seed_on(rig, truths[0]))

@@ -21,6 +21,9 @@ _HELD_S = 1.5
 # A length that has kept within this part for so long is the thread's own.
 _STEADY = 0.015
 _SETTLED_S = 0.7
+# One whose mean of late has kept so near to the mean of long for so long does not change at all: one that is
+# drawn out slowly does.
+_CONSTANT, _CONSTANT_S = 0.002, 1.0
 _FORGOTTEN_S = 3.0
 _NS = 1e-9
 
@@ -46,14 +49,16 @@ class EndWatch:
         self._found_ns = now_ns
         self._last_ns = now_ns
         self._seen_ns = [now_ns, now_ns]
-        self._steady_ns = now_ns
-        self.length = self._longest = self._steady = length
+        self._steady_ns = self._changed_ns = now_ns
+        self.length = self._longest = self._steady = self._recent = length
         self._before = before
         self._is_known = False
         self._gone_on = [0.0, 0.0]
         """By how much the ends have gone on of late."""
         self.settled = False
         """Whether the length has been steady for long enough to be the thread's own."""
+        self.is_constant = False
+        """Whether it has not changed for long, with both ends in sight."""
         self.wanted = length
         """Length that the thread would have if every step at its ends were believed, but for those along
         other threads that are known."""
@@ -90,6 +95,7 @@ class EndWatch:
         self.seen = seen[0], seen[1]
         self.at_border = any(step and step.at_border for step in steps)
         if doubted:
+            self.is_constant, self._changed_ns = False, now_ns
             self._steady_ns += max(now_ns - self._last_ns, 0)
         else:
             self._remember(length * (1.0 + sum(offsets)), now_ns)
@@ -150,8 +156,12 @@ class EndWatch:
         return [end for end in doubted if unseen_s[end] < _HELD_S]
 
     def _remember(self, length: float, now_ns: int) -> None:
+        self._recent += 0.1 * (length - self._recent)
+        if abs(self._recent / self._steady - 1) > _CONSTANT or self.at_border:
+            self._changed_ns = now_ns
+        self.is_constant = (now_ns - self._changed_ns) * _NS > _CONSTANT_S
         if abs(length / self._steady - 1) > _STEADY:
-            self._steady, self._steady_ns = length, now_ns
+            self._steady, self._recent, self._steady_ns = length, length, now_ns
         self._steady += 0.02 * (length - self._steady)
         self.settled = (now_ns - self._steady_ns) * _NS > _SETTLED_S
         self._is_known |= self.settled

@@ -314,8 +314,7 @@ class Follower:
     def _own_length(self) -> float | None:
         """The thread's own length, where it was last seen from end to end and lay alone."""
         ends = self.model.ends
-        is_told = self._is_clear and ends.settled and all(ends.seen) and not ends.at_border
-        return ends.length if is_told else None
+        return ends.length if self._is_clear and ends.is_constant else None
 
     def _learn_motion(self, before: Nurbs, evidence: Evidence, seconds: float) -> None:
         """An end that comes into sight does not move as fast as it is drawn out."""
