@@ -109,6 +109,24 @@ def test_a_thread_that_vanishes_is_lost_in_time_and_found_again(rig: StereoRig) 
     assert np.linalg.norm(start - before[0]) < np.linalg.norm(start - before[1])
 
 
+@pytest.mark.parametrize(("length", "is_it"), [(60.0, True), (62.0, False)])
+def test_a_thread_that_was_taken_elsewhere_while_it_was_lost_is_found_by_its_length(
+    rig: StereoRig, length: float, is_it: bool
+) -> None:
+    here = thread(0.0, 60.0) - [0, 15, 0]
+    there = thread(0.0, length)[:, [1, 0, 2]] + [-15, 28, 0]
+    shown = [[here]] * 10 + [[]] * 12 + [[there]] * 40
+    fields = [paint(rig, threads, i) for i, threads in enumerate(shown)]
+    states = follow(fields, rig, seed_on(rig, here))
+    assert states[21].status is Status.LOST
+    assert any("found again" in state.events for state in states[22:]) is is_it
+    if is_it:
+        assert states[-1].status is Status.TRACKING
+        assert error(states[-1], there).rms < 0.1
+    else:
+        assert all(state.status is not Status.TRACKING for state in states[22:])
+
+
 @pytest.mark.parametrize("away_s", [0.1, 1.0, 2.0])
 def test_another_tracker_takes_a_thread_up(rig: StereoRig, away_s: float) -> None:
     truths = [thread(i / FPS) for i in range(6 + round(away_s * FPS) + 12)]

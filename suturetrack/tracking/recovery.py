@@ -1,4 +1,4 @@
-"""Finds a thread again that was lost: from the last curve, then from the last seed."""
+"""Finds a thread again that was lost: from the last curve, then from the last seed, then anywhere."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from suturetrack.metrics import polyline_distances, polyline_length
 from suturetrack.nurbs import evaluate, reversed_curve, tangents
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
-from suturetrack.tracking.length import has_length
+from suturetrack.tracking.length import has_length, length_error
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import Neighbours, Strand
 from suturetrack.tracking.sureness import SURE
@@ -34,6 +34,8 @@ _SAME = 0.9
 _EVENLY = np.linspace(0, 1, 4 * _PLACES)
 # How near and for how long an end may run along another thread, and what more leaves of the confidence.
 _BESIDE_PX, _LONGEST_PX, _DOUBTED = 5.0, 12.0, 0.3
+# What is as clear as the thread, of its own response, and how closely its length is met elsewhere.
+_AS_CLEAR, _CLOSELY = 0.7, 0.01
 # How near to a seed a thread passes that runs along the other one there, for a while.
 _MEETS_PX = 25.0
 
@@ -105,6 +107,32 @@ def starts_on(last: Nurbs, seed: Seed, field: RidgeField, rig: StereoRig) -> lis
     chosen = [best[0], *far[: _SEEDS - 1]]
     clear = points[chosen][shown[chosen] > 0]
     return [*(Seed(seed.thread, point=(float(x), float(y), float(z))) for x, y, z in clear), seed]
+
+
+def find_elsewhere(
+    last: Nurbs,
+    known_lengths: tuple[float, ...],
+    level: float,
+    field: RidgeField,
+    setup: Setup,
+    name: str,
+) -> Initialization | None:
+    """The thread where neither its last curve nor its seed is, for it may have moved on while it was lost.
+
+    It is looked for at one of the places that the left view shows as clearly, another one in each field.
+    Nothing but its length tells that it is the thread, so that has to be known, and met closely by a
+    look that is sure by itself.
+    """
+    shown = np.linalg.norm(field.left, axis=2) > _AS_CLEAR * level
+    places = np.argwhere(shown)[:, ::-1]
+    if not (len(places) and known_lengths):
+        return None
+    place = places[np.random.default_rng(field.stamp.frame).integers(len(places))]
+    u, v = (float(c) for c in setup.rig.raw_pixels(place))
+    found = find_again(last, known_lengths, [Seed(name, pixel=(u, v))], field, setup)
+    if found is None or found.confidence < SURE:
+        return None
+    return found if length_error(found.curve, known_lengths) < _CLOSELY else None
 
 
 def lies_on(curve: Nurbs, others: Neighbours, rig: StereoRig) -> bool:

@@ -16,6 +16,7 @@ from suturetrack.tracking.recovery import (
     directed,
     doubting_ends,
     find_again,
+    find_elsewhere,
     known_as,
     lies_on,
     means_no_other,
@@ -74,6 +75,8 @@ class Again:
     """With the rows on which the last curve was held."""
     before: tuple[Follower, ...]
     """Who knows how long the thread is."""
+    level: float
+    """How clearly the left view showed it."""
     turn: int | None
     """From which of the places a brief search begins; None for one that takes all the time."""
 
@@ -82,8 +85,9 @@ class Again:
         starts = starts_on(self.last, self.seed, field, self.rig)
         is_brief, first = self.turn is not None, (self.turn or 0) % len(starts)
         starts = starts[first:] + starts[:first]
-        return find_again(
-            self.last, self.known_lengths, starts, field, self.setup, is_brief=is_brief
+        looked_for = self.last, self.known_lengths
+        return find_again(*looked_for, starts, field, self.setup, is_brief=is_brief) or (
+            find_elsewhere(*looked_for, self.level, field, self.setup, self.seed.thread)
         )
 
     def beside(self, others: Neighbours, found: Initialization) -> Found:

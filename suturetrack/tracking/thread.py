@@ -30,7 +30,7 @@ _REST = 4
 _QUICK_ATTEMPTS = 6
 _RAREST = 3
 # After so many in vain, some 5 s, it may have been cut or drawn out meanwhile: what is sure to be a thread
-# may have any length.
+# may have any length, at every other attempt.
 _ATTEMPTS = 12
 # And so many in vain at one that is followed, a second: it may be another one that had its length.
 _LOOKS = 2
@@ -199,13 +199,18 @@ class Thread:
         self._attempts += 1
         turn = self._attempts - 1 if is_beside else None
         if self.follower is not None:
-            last, rig = self.follower.last_good, self.follower.rig
-            is_known = self._attempts <= _ATTEMPTS and self._looks_in_vain < _LOOKS
-            before = self._who_knows_its_length() if is_known else ()
-            return Again(self._seed, self._setup, last, lengths(before), rig, before, turn)
+            held, knows = self.follower, self._looks_in_vain < _LOOKS
+            knows &= self._attempts <= _ATTEMPTS or self._attempts % 2 == 0
+            before = self._who_knows_its_length() if knows else ()
+            level, known = held.model.levels[0], lengths(before)
+            return Again(
+                self._seed, self._setup, held.last_good, known, held.rig, before, level, turn
+            )
         assert self._state.curve is not None
         known = (self._state.length,) if self._attempts <= _QUICK_ATTEMPTS else ()
-        return Again(self._seed, self._setup, self._state.curve, known, self._setup.rig, (), turn)
+        return Again(
+            self._seed, self._setup, self._state.curve, known, self._setup.rig, (), 1.0, turn
+        )
 
     def _search_closer(self, now_ns: int) -> Search | None:
         assert self.follower is not None
