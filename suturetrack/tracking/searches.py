@@ -75,8 +75,8 @@ class Again:
     """With the rows on which the last curve was held."""
     before: tuple[Follower, ...]
     """Who knows how long the thread is."""
-    level: float
-    """How clearly the left view showed it."""
+    level: float | None
+    """How clearly the left view showed it, where it may be anywhere by now; None while it is held."""
     turn: int | None
     """From which of the places a brief search begins; None for one that takes all the time."""
 
@@ -85,10 +85,11 @@ class Again:
         starts = starts_on(self.last, self.seed, field, self.rig)
         is_brief, first = self.turn is not None, (self.turn or 0) % len(starts)
         starts = starts[first:] + starts[:first]
-        looked_for = self.last, self.known_lengths
-        return find_again(*looked_for, starts, field, self.setup, is_brief=is_brief) or (
-            find_elsewhere(*looked_for, self.level, field, self.setup, self.seed.thread)
-        )
+        wanted, setup = (self.last, self.known_lengths), self.setup
+        found = find_again(*wanted, starts, field, setup, is_brief=is_brief)
+        if found is not None or self.level is None:
+            return found
+        return find_elsewhere(*wanted, self.level, field, setup, self.seed.thread)
 
     def beside(self, others: Neighbours, found: Initialization) -> Found:
         """What was found, unless it is one of the other threads."""

@@ -202,14 +202,14 @@ class Thread:
             held, knows = self.follower, self._looks_in_vain < _LOOKS
             knows &= self._attempts <= _ATTEMPTS or self._attempts % 2 == 0
             before = self._who_knows_its_length() if knows else ()
-            level, known = held.model.levels[0], lengths(before)
+            level, known = None if self.is_held else held.model.levels[0], lengths(before)
             return Again(
                 self._seed, self._setup, held.last_good, known, held.rig, before, level, turn
             )
         assert self._state.curve is not None
         known = (self._state.length,) if self._attempts <= _QUICK_ATTEMPTS else ()
         return Again(
-            self._seed, self._setup, self._state.curve, known, self._setup.rig, (), 1.0, turn
+            self._seed, self._setup, self._state.curve, known, self._setup.rig, (), None, turn
         )
 
     def _search_closer(self, now_ns: int) -> Search | None:
