@@ -192,10 +192,16 @@ def _shown(image: Image, pixel: Float64, octave: int) -> _Shown | None:
     """The ridge that stands out most near the seed, in the image halved `octave` times."""
     crop, seed = _window(*_shrunk(image, pixel, octave))
     scene = _Scene.of(crop, SIGMAS[0])
-    ridges = _ridges_near(scene, seed, max(_SNAP_PX / 2**octave, _LEAST_SNAP_PX))
+    reach = max(_SNAP_PX / 2**octave, _LEAST_SNAP_PX)
+    ridges = _ridges_near(scene, seed, reach)
     if not ridges:
         return None
-    weights, ridge = max(ridges, key=lambda r: _score(scene, r[0], r[1], scene.nuisance))
+
+    def standing(weights: Float64, ridge: _Ridge) -> float:
+        near = float(_nearness(ridge.pixels, seed, reach).max())
+        return near * _score(scene, weights, ridge, scene.nuisance)
+
+    weights, ridge = max(ridges, key=lambda r: standing(*r))
     response = float(np.linalg.norm(np.median(ridge.across(scene), axis=0)))
     score = _score(scene, weights, ridge, scene.clutter)
     return _Shown(octave, _Ridge(ridge.pixels - seed, ridge.normals), score, response)
@@ -289,8 +295,13 @@ def _starts(scene: _Scene, seed: Float64, reach: float) -> list[tuple[int, int]]
     near &= (u < width) & (v < height)
     v, u = v[near], u[near]
     unlike = _most_unlike(scene, v, u)[0]
-    unlike *= np.exp(-((u - seed[0]) ** 2 + (v - seed[1]) ** 2) / reach**2)
+    unlike *= _nearness(np.stack([u, v], axis=1), seed, reach) ** 2
     return [(int(v[i]), int(u[i])) for i in _peaks(unlike, v, u, apart=2)]
+
+
+def _nearness(pixels: Float64, seed: Float64, reach: float) -> Float64:
+    """(N,) what pixels count: 1 at the seed, 0.6 at the end of its reach."""
+    return np.asarray(np.exp(-np.sum((pixels - seed) ** 2, axis=1) / (2 * reach**2)))
 
 
 def _peaks(values: Float64, v: Float64, u: Float64, apart: float) -> list[int]:
