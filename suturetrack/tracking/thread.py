@@ -202,7 +202,8 @@ class Thread:
             held, knows = self.follower, self._looks_in_vain < _LOOKS
             knows &= self._attempts <= _ATTEMPTS or self._attempts % 2 == 0
             before = self._who_knows_its_length() if knows else ()
-            level, known = None if self.is_held else held.model.levels[0], lengths(before)
+            known = lengths(before)
+            level = None if self.is_held else held.model.levels[0]
             return Again(
                 self._seed, self._setup, held.last_good, known, held.rig, before, level, turn
             )
