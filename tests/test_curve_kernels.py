@@ -10,11 +10,12 @@ from numba.core.dispatcher import Dispatcher
 
 from suturetrack import kernels, nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import rows, search, spline
+from suturetrack.kernels import rows, search, spline, widths
 from suturetrack.kernels.boundary import outer_boundary
 from tests.reference import boundary as boundary_reference
 from tests.reference import curve_fit as reference
 from tests.reference import strands as strands_reference
+from tests.reference import widths as widths_reference
 
 RNG = np.random.default_rng(3)
 KNOTS = nurbs.clamped_knots(np.array([0.07, 0.2, 0.45, 0.5, 0.81]), 3)
@@ -267,6 +268,30 @@ def test_a_thread_ends_where_the_twin_has_it_end(seed: int) -> None:
         f(x, mean, least) for f in (outer_boundary, boundary_reference.outer_boundary)
     )
     np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@given(st.integers(0, 10_000))
+def test_ridges_are_as_wide_as_their_twins(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count, across = int(rng.integers(1, 30)), np.arange(-4.0, 4.1, 0.5)
+    profiles = rng.uniform(0, 1, (count, len(across))) * rng.integers(0, 2, (count, 1))
+    offsets = np.sort(rng.normal(0, 3, profiles.shape), axis=1)
+    for found, expected in zip(
+        widths.moments(profiles, offsets),
+        widths_reference.moments(profiles, offsets),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+    # A ridge that becomes wider.
+    v, u = np.mgrid[:25, :60]
+    field = np.zeros((25, 60, 2), np.float32)
+    field[..., 0] = np.exp(-0.5 * ((v - 12) / (1.5 + (u > 30) * rng.uniform(0, 2))) ** 2)
+    pixels = np.c_[np.arange(60.0), np.full(60, rng.uniform(11, 13))]
+    tangents, alone = np.tile([1.0, 0.0], (60, 1)), np.arange(60) < rng.integers(1, 60)
+    arguments = field, pixels, tangents, across, alone
+    narrow = widths.narrowness(*arguments)
+    np.testing.assert_allclose(narrow, widths_reference.narrowness(*arguments), atol=1e-6)
+    assert (widths.narrowness(*arguments[:4], np.zeros(60, bool)) == 1).all()
 
 
 def random_strand(rng: np.random.Generator, count: int) -> strands_reference.Strand:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from suturetrack.kernels import search
+from suturetrack.kernels.widths import moments, single
 from suturetrack.metrics import polyline_tangents
 from suturetrack.types import Float32, Float64
 
@@ -15,10 +16,6 @@ _OFFSETS = np.arange(-4.0, 4.01, 0.5)
 """Where the crest is looked for across the curve, px."""
 _NEAR_PX = 2.0
 """How far the crest is expected from the curve, px (standard deviation)."""
-_WIDE = 1.15
-"""Squared width of a ridge, against the usual one, from which another strand is in it."""
-_WIDENED = 12
-"""Power of the width beyond that by which such a crest counts less."""
 _CENTROID_REACH = 4
 """Offsets on each side of the peak whose centroid is the crest."""
 _ASIDE_PX = 5.0
@@ -80,16 +77,3 @@ def find_crest(view: View, pixels: Float64) -> Crest:
     normals = np.c_[-tangents[:, 1], tangents[:, 0]]
     clear = single(spread, usual) * view.clear(pixels)
     return Crest(normals, np.where(seen, offsets, 0.0), np.where(seen, heights, 0.0), clear)
-
-
-def moments(profiles: Float64, offsets: Float64) -> tuple[Float64, Float64]:
-    """(k,) middle and squared width of a ridge, px, from (k, m) responses across it at the offsets."""
-    weights = np.maximum(profiles - profiles.min(1, keepdims=True), 0) ** 2
-    total = np.maximum(weights.sum(1), 1e-12)
-    middle = (weights * offsets).sum(1) / total
-    return middle, (weights * (offsets - middle[:, None]) ** 2).sum(1) / total
-
-
-def single(spread: Float64, usual: float) -> Float64:
-    """(k,) in [0, 1]: low where a ridge of this squared width is more than one strand."""
-    return np.maximum(spread / max(_WIDE * usual, 1e-12), 1.0) ** -_WIDENED

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from suturetrack.initialization.crest import moments
 from suturetrack.initialization.matching import disparities
 from suturetrack.initialization.segments import chain_tangents
 from suturetrack.kernels import search
+from suturetrack.kernels.widths import moments
 from suturetrack.types import Float32, Float64
 
 _STATE_PX = 0.5
@@ -82,4 +82,5 @@ class Depth:
         places = pixels[:, None] - (coarse[:, None] + _FINE)[..., None] * np.array([1.0, 0.0])
         repeated = np.repeat(tangents, len(_FINE), axis=0)
         profiles = search.responses(self.other, places.reshape(-1, 2), repeated)
-        return coarse + moments(profiles.reshape(-1, len(_FINE)), _FINE)[0]
+        fine = np.tile(_FINE, (len(coarse), 1))
+        return coarse + moments(profiles.reshape(fine.shape), fine)[0]

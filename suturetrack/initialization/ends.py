@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from suturetrack.initialization.crest import moments, single
-from suturetrack.kernels import search
+from suturetrack.kernels import search, widths
 from suturetrack.metrics import arc_lengths, polyline_at, polyline_tangents
 from suturetrack.types import Float32, Float64
 
@@ -72,11 +71,8 @@ def narrowness(field: Float32, pixels: Float64, tangents: Float64, x: Float64) -
         tangents: (k, 2), unit.
         x: (k,) px beyond the end.
     """
-    profiles = search.normal_profiles(field, pixels, tangents, _ACROSS, 0.0)
-    _, spread = moments(profiles, _ACROSS)
     inner, outer = _ALONE_PX
-    alone = spread[(x >= inner) & (x < outer)]
-    return single(spread, float(np.median(alone))) if len(alone) else np.ones(len(x))
+    return widths.narrowness(field, pixels, tangents, _ACROSS, (x >= inner) & (x < outer))
 
 
 def widens_at(x: Float64, narrow: Float64, level: float) -> float:

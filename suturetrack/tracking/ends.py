@@ -22,6 +22,8 @@ _INWARD_PX, _OUTWARD_PX = 40.0, 10.0
 _SMOOTHED = 5
 # Where the curve tells how long a pixel is.
 _ALONG = np.linspace(0, 1, 51)
+# Where it tells how the thread goes on, from the end inwards.
+_BEND = np.linspace(0, 0.04, 5)
 # An end that points along the line of sight is taken to be foreshortened to this part of the rest, at most.
 _FORESHORTENED = 0.5
 # An end that a view shows further away than this from the curve's own is another one, or covered.
@@ -65,17 +67,14 @@ def find_end(
     inside = both[0].inside(images.rig.image_size) & both[1].inside(images.rig.image_size)
     if np.count_nonzero(inside) < _SMOOTHED:
         return None
-    narrow = [
+    left, right = responses
+    narrow_left, narrow_right = (
         response * narrowness(image, view.pixels, view.tangents, x)
         for image, view, response in zip(images.both, both, responses, strict=True)
-    ]
-    x, mean, least, alone = (
-        x[inside],
-        _smooth(np.mean(responses, axis=0)[inside]),
-        np.min(responses, axis=0)[inside],
-        _smooth(np.mean(narrow, axis=0)[inside]),
     )
-    found, level = outer_boundary(x, mean, np.minimum(_smooth(least) + 0.15, mean))
+    profiles = (left + right) / 2, np.minimum(left, right), (narrow_left + narrow_right) / 2
+    x, (mean, least, alone) = x[inside], _smooth(np.stack(profiles)[:, inside])
+    found, level = outer_boundary(x, mean, np.minimum(least + 0.15, mean))
     if math.isnan(found):
         return None
     widens = widens_at(x, alone, level)
@@ -101,9 +100,8 @@ def end_shift(
     x, both, responses = _profiles(curve, end, images, scale)
     tip = int(np.searchsorted(x, 0.0))
     shown, rows = [], []
-    for view, response in zip(both, responses, strict=True):
-        smooth = _smooth(response)
-        found, _ = outer_boundary(x, smooth, smooth)
+    for view, response in zip(both, _smooth(np.stack(responses)), strict=True):
+        found, _ = outer_boundary(x, response, response)
         # Not where it is nan, either.
         if not (view.inside(images.rig.image_size).all() and abs(found) <= _SHOWN_PX):
             return None
@@ -129,8 +127,9 @@ def _profiles(
     return x, both, responses
 
 
-def _smooth(profile: Float64) -> Float64:
-    return np.asarray(uniform_filter1d(profile, _SMOOTHED, mode="nearest"))
+def _smooth(profiles: Float64) -> Float64:
+    """Means over a few samples of each row."""
+    return np.asarray(uniform_filter1d(profiles, _SMOOTHED, mode="nearest"))
 
 
 def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:
@@ -146,7 +145,7 @@ def _extension(curve: Nurbs, end: int, beyond: Float64) -> tuple[Float64, Float6
     inner = float(end) + sign * np.minimum(beyond, 0.0)
     outer = np.maximum(beyond, 0.0)[:, None]
     points, first, _ = derivatives_at(curve, inner)
-    _, slope, second = derivatives_at(curve, float(end) - sign * np.linspace(0, 0.04, 5))
+    _, slope, second = derivatives_at(curve, float(end) - sign * _BEND)
     tip, bend = slope[0], second.mean(axis=0)
     points = points + outer * sign * tip + outer**2 / 2 * bend
     first = np.where(outer > 0, tip + sign * outer * bend, first)

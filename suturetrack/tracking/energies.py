@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.tracking.sampling import Samples, views
+from suturetrack.tracking.sampling import Samples, views, views_at
 from suturetrack.types import Energies, Float32, Float64, Nurbs, RidgeField
 
 
@@ -46,8 +46,7 @@ def cutoff(image: Float32, level: float) -> float:
 
 
 def _end(curve: Nurbs, field: RidgeField, rig: StereoRig, levels: tuple[float, float]) -> float:
-    ends = Samples.at(curve.knots, np.array([0.0, 1.0]))
-    both = ends.views(rig, curve.control_points)
+    both = views_at(rig, curve, np.array([0.0, 1.0]))
     return sum(
         float(np.sum((view.responses(image) - cutoff(image, level)) ** 2))
         for image, view, level in zip((field.left, field.right), both, levels, strict=True)

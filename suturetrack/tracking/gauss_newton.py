@@ -256,7 +256,8 @@ class _Linearized:
             rows.add_measured_rows(
                 view.tangents, view.jacobian, alone, found.offset, information, pull
             )
-        self._add_middle(together, weights[0] + weights[1], information, pull)
+        if together.any():
+            self._add_middle(together, weights[0] + weights[1], information, pull)
         equations.add(self.samples, 0, information, pull)
         equations.add(self.samples, 2, *self._shape(reference, config, surprise))
         return equations

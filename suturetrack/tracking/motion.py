@@ -9,11 +9,12 @@ import numpy as np
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import spline
 from suturetrack.nurbs import clamped_knots, curve_from
-from suturetrack.tracking.sampling import Samples, views
+from suturetrack.tracking.sampling import Samples, derivatives_at, values_at, views
 from suturetrack.types import Bool, Float64, Nurbs
 
 _KNOTS = clamped_knots(np.linspace(0, 1, 6)[1:-1], spline.DEGREE)
-_PLACES = 40
+_PLACES = np.linspace(0, 1, 40)
+_SAMPLES = Samples.at(_KNOTS, _PLACES)
 _GAIN = 0.9
 _FADING_S = 0.5
 _LONGEST_STEP_S = 0.25
@@ -34,11 +35,12 @@ class Motion:
         return cls(np.zeros((len(_KNOTS) - spline.ORDER, 3)))
 
     def predict(self, curve: Nurbs, seconds: float) -> Nurbs:
-        """The curve after `seconds`; where it is after a long or backward step in time."""
+        """The cubic curve after `seconds`; where it is after a long or backward step in time."""
         if not 0 < seconds <= _LONGEST_STEP_S:
             return curve
-        s = np.lib.stride_tricks.sliding_window_view(curve.knots[1:-1], curve.degree).mean(axis=1)
-        step = Samples.at(_KNOTS, s).values(self.coefficients) * seconds
+        knots = curve.knots
+        s = (knots[1:-3] + knots[2:-2] + knots[3:-1]) / spline.DEGREE
+        step = spline.evaluate(s, _KNOTS, self.coefficients)[0] * seconds
         return curve_from(curve.degree, curve.knots, curve.control_points + step)
 
     def learn(
@@ -61,36 +63,30 @@ class Motion:
         """
         if not 0 < seconds <= _LONGEST_STEP_S:
             return Motion.none()
-        s = np.linspace(0, 1, _PLACES)
-        samples = Samples.at(after.knots, s)
-        points, first = (
-            samples.values(after.control_points),
-            samples.values(after.control_points, 1),
-        )
-        moved = points - Samples.at(before.knots, s).values(before.control_points)
-        information = np.zeros((_PLACES, 3, 3))
+        points, first, _ = derivatives_at(after, _PLACES)
+        moved = points - values_at(before, _PLACES)
+        information = np.zeros((len(_PLACES), 3, 3))
         for view in views(rig, points, first):
             row = (view.normals[:, None, :] @ view.jacobian)[:, 0, :]
             information += row[:, :, None] * row[:, None, :]
             for end, end_seen in ((0, ends_seen[0]), (-1, ends_seen[1])):
                 if end_seen:
                     information[end] += view.jacobian[end].T @ view.jacobian[end]
-        information *= seen[np.round(s * (len(seen) - 1)).astype(int), None, None]
-        measured = _fit(information, moved / seconds, s)
+        information *= seen[np.round(_PLACES * (len(seen) - 1)).astype(int), None, None]
+        measured = _fit(information, moved / seconds)
         share = float(seen.mean())
         kept = self.coefficients * np.exp(-(1 - share) * seconds / _FADING_S)
         return Motion(kept + _GAIN * share * (measured - kept))
 
 
-def _fit(information: Float64, velocity: Float64, s: Float64) -> Float64:
+def _fit(information: Float64, velocity: Float64) -> Float64:
     """(m, 3) coefficients of the smoothest velocity that the information allows."""
-    samples = Samples.at(_KNOTS, s)
     band, right = spline.no_rows(len(_KNOTS) - spline.ORDER)
     pull = (information @ velocity[:, :, None])[:, :, 0]
-    spline.add_rows(samples.first, samples.table[0], information, pull, band, right)
+    spline.add_rows(_SAMPLES.first, _SAMPLES.table[0], information, pull, band, right)
     scale = float(np.trace(information, axis1=1, axis2=2).mean()) + np.finfo(float).tiny
     even = np.broadcast_to(_STIFFNESS * scale * np.eye(3), information.shape)
-    spline.add_rows(samples.first, samples.table[1], even, np.zeros_like(pull), band, right)
+    spline.add_rows(_SAMPLES.first, _SAMPLES.table[1], even, np.zeros_like(pull), band, right)
     band[:, 0] += 1e-6 * scale
     spline.factorize(band)
     return spline.solve_factorized(band, right).reshape(-1, 3)

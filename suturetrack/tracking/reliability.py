@@ -84,7 +84,7 @@ class Evidence:
         """(k,) whether no other ridge runs close beside the thread, at evenly spaced parameters."""
         return ~self._even(self.fit.crowd.others)
 
-    @property
+    @cached_property
     def length_noise(self) -> float:
         """What noise in depth makes of a length."""
         return _NOISE_SIGMAS * float(np.median(self.sigma))
