@@ -235,6 +235,24 @@ def test_a_stretch_keeps_its_depth_while_it_runs_along_an_epipolar_line(
     assert max(off) < 0.65
 
 
+@pytest.mark.parametrize(("aside", "rounds"), [(0.0, 2), (1.0, 3)])
+def test_a_curve_that_lies_on_the_thread_is_soon_fitted(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, aside: float, rounds: int
+) -> None:
+    truth = thread(0.0)
+    guess, searched = curve_through(truth + np.array([0.0, aside, 0.0])), []
+    field = paint(rig, [truth], 0)
+    images = Images(field, rig, measure_levels(curve_through(truth), field, rig))
+    search = gauss_newton.search_normals
+    monkeypatch.setattr(
+        gauss_newton, "search_normals", lambda *args: searched.append(0) or search(*args)
+    )
+    fit = gauss_newton.fit(guess, guess, images, 5.0, TrackingConfig())
+    assert len(searched) == 2 * rounds
+    points = nurbs.evaluate(fit.curve, np.linspace(0, 1, 400))
+    assert metrics.curve_error(points, truth).rms < 0.1
+
+
 def bowed(relief: float, degrees: float) -> np.ndarray:
     """(800, 3) points of a thread, turned by so much, whose middle bows towards or away from the cameras."""
     x, angle = np.linspace(-25, 25, 800), np.radians(degrees)

@@ -59,7 +59,7 @@ class TrackingConfig:
     """How far to each side of the predicted curve the thread is looked for first; up to 6.5 times as
     far where it is not found."""
     iterations: int = 3
-    """Gauss-Newton steps a field."""
+    """Gauss-Newton steps a field, at most."""
     noise_px: float = 0.1
     """Standard deviation of a centreline offset measured in the field."""
     drift_px: float = 2.0

@@ -37,6 +37,8 @@ _LEAST_SURPRISE_PX, _SMOOTH = 0.3, 9
 # Share of its second derivatives that the curve is asked to keep where the prediction holds, and the
 # surprise from which on it does not.
 _KEPT, _FAILED_PX = 0.95, 0.6
+# A step that moves no sample further than this is the last: it is a part of what one reading is off.
+_SETTLED_PX = 0.1
 # How far from a free end, which nothing bends, it is asked to keep less.
 _FREE_PX = 20.0
 # A first search does not know the thread's direction yet where it has bent.
@@ -138,10 +140,13 @@ def fit(
         if known_length is not None:
             step = linear.keeping_length(step, equations, known_length)
         control_points = control_points + step
+        pixels = images.rig.project(samples.values(control_points))
+        if math.isfinite(outlier) and linear.is_near(pixels):
+            break
         outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
         reach = max(reach / 2, _REFINED_PX)
     curve = curve_from(spline.DEGREE, predicted.knots, control_points)
-    residual = _residual(images.rig.project(samples.values(control_points)), linear)
+    residual = _residual(pixels, linear)
     covariance = equations.covariance(samples)
     return Fit(curve, samples, linear.offsets, residual, covariance, crowd)
 
@@ -326,6 +331,11 @@ class _Linearized:
         moved = equations.solve_for(row)
         doubt = _LENGTH_DOUBT * known * (1 + (lacking / (_LENGTH_OUTLIER * known)) ** 2)
         return step + lacking / (doubt**2 + float(np.sum(row * moved))) * moved
+
+    def is_near(self, pixels: tuple[Float64, Float64]) -> bool:
+        """Whether the samples, which are at these pixels now, have hardly moved."""
+        both = zip(pixels, self.views, strict=True)
+        return max(float(np.abs(moved - view.pixels).max()) for moved, view in both) < _SETTLED_PX
 
     def surprise(self, crowd: Crowd) -> Float64:
         """(k,) px by which the thread has left the curve where it is alone, and so in between."""
