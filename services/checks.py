@@ -23,6 +23,7 @@ from suturetrack.camera import LARGEST_SIDE, Camera, StereoRig
 from suturetrack.types import (
     Energies,
     Grasp,
+    InputError,
     Nurbs,
     RidgeField,
     Seed,
@@ -46,6 +47,14 @@ def check_name(name: str, what: str) -> None:
     """Raises ValueError for a name that cannot be part of a key."""
     if not NAME.fullmatch(name):
         raise ValueError(f"{what} {name[:80]!r}: use 1 to 64 of A-Z a-z 0-9 _ -")
+
+
+def check_rig(name: str) -> None:
+    """Raises InputError for a name that no rig can have."""
+    try:
+        check_name(name, "rig")
+    except ValueError as error:
+        raise InputError(str(error)) from error
 
 
 def _require(condition: object, complaint: str) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 
 from services import topics
 from services.bus import DEPTH, Bus, NoAnswer
-from services.checks import check, check_name
+from services.checks import check, check_rig
 from services.freshness import Freshness
 from services.inbox import Inbox
 from services.messages import Forget, GraspRequest, SeedReply, ToolPose
@@ -108,10 +108,7 @@ def connect(rig: str = "rig", zenoh: Path | str | None = None, *, waits: bool = 
     Raises:
         InputError: a bad name, a configuration that cannot be used, or no router.
     """
-    try:
-        check_name(rig, "rig")
-    except ValueError as error:
-        raise InputError(str(error)) from error
+    check_rig(rig)
     config = local_config(rig, "client") if zenoh is None else load_config(Path(zenoh))
     return Client(Bus(ZenohTransport(config, waits=waits), rig, "client"))
 

@@ -20,7 +20,7 @@ from cryptography import x509
 from rich.console import Console
 from rich.text import Text
 
-from services.status import RigWatch, watch_rigs
+from services.status import RigWatch, nothing_runs, watch_rigs
 from services.tables import new_table
 from services.topics import PROCESSES
 from services.zenoh_transport import load_config, socket_directory
@@ -86,18 +86,24 @@ def examine(config: DoctorConfig) -> Iterator[Finding]:
     try:
         watches = watch_rigs(config.rig, config.zenoh, _LISTEN_S)
     except InputError as error:
-        text, _, advice = str(error).partition("; ")
-        yield Finding(ERROR, "running system", text, advice)
+        yield _fault(str(error))
         return
     try:
         running = [watch for watch in watches.values() if watch.health]
-        if not running:
+        if not running and config.rig is None:
             yield Finding(OK, "running system", "none")
+        elif not running:
+            yield _fault(nothing_runs(config.rig))
         for watch in running:
             yield from _system(watch)
     finally:
         for watch in watches.values():
             watch.close()
+
+
+def _fault(text: str) -> Finding:
+    found, _, advice = text.partition("; ")
+    return Finding(ERROR, "running system", found, advice)
 
 
 def certificates(zenoh: Path) -> Iterator[Finding]:

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from services import access
-from services.checks import check_name
+from services.checks import check_rig
 from suturetrack.types import InputError
 
 _CLOSED = {"scouting/multicast/enabled": False, "scouting/gossip/enabled": False}
@@ -120,10 +120,7 @@ def _check(config: KeysConfig) -> None:
     if not config.rigs:
         raise InputError("keys: name one or more --rigs")
     for rig in config.rigs:
-        try:
-            check_name(rig, "rig")
-        except ValueError as error:
-            raise InputError(str(error)) from error
+        check_rig(rig)
     if not 1 <= config.port <= 65535:
         raise InputError(f"port {config.port}: use 1 to 65535")
     if not 1 <= config.days <= 3650:

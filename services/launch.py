@@ -23,7 +23,7 @@ from rich.text import Text
 
 from services.arguments import arguments_of, write_config
 from services.bus import Bus
-from services.checks import check_name
+from services.checks import check_rig
 from services.fleet import Fleet, Launch
 from services.monitor import Monitor
 from services.service import ServiceConfig, SharedConfig
@@ -164,10 +164,7 @@ def _make_run_folder(config: RunConfig, rig: StereoRig) -> None:
 @contextmanager
 def _reserved(service: SharedConfig) -> Iterator[str]:
     """The name of the rig, for this run alone; the default name gives way to a run that has it."""
-    try:
-        check_name(service.rig, "rig")
-    except ValueError as error:
-        raise InputError(str(error)) from error
+    check_rig(service.rig)
     if service.zenoh is not None:
         yield service.rig
         return

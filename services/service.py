@@ -22,7 +22,7 @@ import psutil
 
 from services import topics, wire
 from services.bus import Bus, NoAnswer
-from services.checks import check_name
+from services.checks import check_rig
 from services.messages import Health
 from services.meter import Meter
 from services.watchdog import Watchdog
@@ -254,10 +254,7 @@ def run(name: str, config: ServiceConfig, body: Callable[[Service], None]) -> No
     Raises:
         InputError: something that the user gave is at fault.
     """
-    try:
-        check_name(config.rig, "rig")
-    except ValueError as error:
-        raise InputError(str(error)) from error
+    check_rig(config.rig)
     with suppress(OSError):
         # What `ps` and `top` show.
         Path("/proc/self/comm").write_text(name)

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from services import topics
 from services.bus import Bus
+from services.checks import check_rig
 from services.client import Client, Seen
 from services.messages import Health
 from services.tables import new_table, number, report_console
@@ -42,6 +43,7 @@ class RigWatch:
     """What is heard of one rig."""
 
     def __init__(self, rig: str, zenoh: Path | None, *, waits: bool = True):
+        check_rig(rig)
         config = local_config(rig, "status") if zenoh is None else load_config(zenoh)
         self.rig = rig
         self.health: dict[str, tuple[Health, int]] = {}
@@ -126,14 +128,14 @@ def run(config: StatusConfig) -> None:
             _look(config, watches, _FIRST_S)
             shown = _tables(watches)
             if not shown:
-                raise InputError(_nothing(config))
+                raise InputError(nothing_runs(config.rig))
             console.print(*shown)
             return
         with Live(console=console, refresh_per_second=4) as live, suppress(KeyboardInterrupt):
             while True:
                 _look(config, watches, _LOOK_S)
                 shown = _tables(watches)
-                live.update(Group(*shown) if shown else Text(_nothing(config)))
+                live.update(Group(*shown) if shown else Text(nothing_runs(config.rig)))
     finally:
         for watch in watches.values():
             watch.close()
@@ -146,8 +148,17 @@ def watch_rigs(rig: str | None, zenoh: Path | None, seconds: float) -> dict[str,
     return watches
 
 
+def nothing_runs(rig: str | None) -> str:
+    """What to say when nothing was heard of a rig, or of any on this machine."""
+    where = "on this machine" if rig is None else f"of rig {rig!r}"
+    others = ", ".join(name for name in local_rigs() if name != rig)
+    instead = f", or name a rig that is here: {others}" if others else ""
+    start = "start some with `suturetrack demo` or `suturetrack run`"
+    return f"no process {where} runs; {start}{instead}"
+
+
 def _look(config: StatusConfig, watches: dict[str, RigWatch], seconds: float) -> None:
-    for rig in [config.rig] if config.rig else local_rigs():
+    for rig in local_rigs() if config.rig is None else [config.rig]:
         if rig not in watches:
             watches[rig] = RigWatch(rig, config.zenoh, waits=not config.once)
     time.sleep(seconds)
@@ -157,8 +168,3 @@ def _look(config: StatusConfig, watches: dict[str, RigWatch], seconds: float) ->
 
 def _tables(watches: dict[str, RigWatch]) -> list[Table]:
     return [table for watch in watches.values() for table in watch.tables()]
-
-
-def _nothing(config: StatusConfig) -> str:
-    where = f"of rig {config.rig!r}" if config.rig else "on this machine"
-    return f"no process {where} runs; start some with `suturetrack demo` or `suturetrack run`"

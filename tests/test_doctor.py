@@ -150,6 +150,21 @@ def test_a_rig_may_have_the_doctors_name(rig_name: str) -> None:
     bus.close()
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "advice"),
+    [
+        ("nobody", "no process of rig 'nobody' runs", "name a rig that is here: test"),
+        ("a/b", "rig 'a/b': use 1 to 64 of A-Z a-z 0-9 _ -", ""),
+        ("", "rig '': use 1 to 64 of A-Z a-z 0-9 _ -", ""),
+    ],
+)
+def test_a_rig_that_was_named_has_to_run(rig: Bus, name: str, text: str, advice: str) -> None:
+    del rig  # it is here, and not the one that was named
+    found = list(examine(DoctorConfig(name)))[-1]
+    assert (found.level, found.text) == (ERROR, text)
+    assert found.advice.endswith(advice)
+
+
 def test_status_shows_processes_and_threads(rig: Bus, capsys: pytest.CaptureFixture[str]) -> None:
     none = np.ones(4)
     now = time.time_ns()
