@@ -345,6 +345,31 @@ def test_a_port_that_is_taken_is_said_in_one_line(stage: Stage) -> None:
             serve(stage.feed, "127.0.0.1", port, "")
 
 
+def test_what_is_printed_opens_also_where_every_address_is_served(
+    stage: Stage, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def said() -> str:
+        nonlocal printed
+        printed += capsys.readouterr().out
+        return printed
+
+    async def opens(url: str) -> bool:
+        async with aiohttp.request("GET", url) as answer:
+            return answer.status == 200
+
+    printed, arguments = "", (stage.feed, "0.0.0.0", 0, "secret")
+    server = threading.Thread(target=serve, args=arguments, daemon=True)
+    server.start()
+    wait_until(lambda: said().count("\n") == 2, tell=said)
+    here, there = printed.split()
+    assert here.startswith("http://localhost:")
+    assert there == here.replace("localhost", socket.gethostname())
+    assert asyncio.run(opens(here))
+    stage.feed.bus.stop.set()
+    server.join(20)
+    assert not server.is_alive()
+
+
 def test_no_stranger_gets_in(stage: Stage) -> None:
     async def flow() -> None:
         async with opened(stage, token="secret") as client:

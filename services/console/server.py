@@ -7,6 +7,7 @@ import hmac
 import os
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
+from socket import gethostname
 from typing import Annotated, Any
 
 import msgspec
@@ -21,6 +22,7 @@ _MOST_ORDERS = 4
 _LARGEST_ORDER = 4096
 _PARTS = {"/": "page.html", "/page.css": "page.css", "/page.js": "page.js"}
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
+_EVERY = ("0.0.0.0", "::")
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 
 Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
@@ -240,9 +242,12 @@ async def _serve(feed: Feed, host: str, port: int, token: str) -> None:
             f"cannot serve on {host}:{port}: {os.strerror(error.errno or 0)}; "
             "give another --port or --host"
         ) from error
-    port = runner.addresses[0][1]
-    where = f"[{host}]" if ":" in host else host
-    print(f"http://{where}:{port}/" + (f"?token={token}" if token else ""), flush=True)
+    address, port = runner.addresses[0][:2]
+    # A browser opens no address that stands for all of a machine's.
+    names = ["localhost", gethostname()] if address in _EVERY else [host]
+    for name in names:
+        where = f"[{name}]" if ":" in name else name
+        print(f"http://{where}:{port}/" + (f"?token={token}" if token else ""), flush=True)
     while not feed.bus.stop.is_set:
         await asyncio.sleep(0.05)
     await console.close()
