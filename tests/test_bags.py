@@ -159,6 +159,17 @@ def test_a_single_mcap_file_is_a_bag_and_frames_can_be_left_out(tmp_path: Path, 
     footage.close()
 
 
+def test_a_loop_of_more_frames_than_a_bag_turns_out_to_have_is_refused(
+    tmp_path: Path, ros2: Ros
+) -> None:
+    path = write(tmp_path / "run.mcap", ros2, frames(ros2))
+    footage, _ = open_input(InputConfig(str(path), loop=COUNT + 1))
+    assert footage.read(COUNT - 1) is not None
+    with pytest.raises(InputError, match=f"--loop {COUNT + 1}: .* no more than the {COUNT} frames"):
+        footage.read(COUNT)
+    footage.close()
+
+
 def test_images_without_a_partner_are_left_out(tmp_path: Path, ros2: Ros) -> None:
     lost = {(LEFT, START_NS + PERIOD_NS), (RIGHT, START_NS + 2 * PERIOD_NS)}
     entries = [e for e in frames(ros2) if (e[1], e[0] - 1_000_000) not in lost]
