@@ -23,7 +23,7 @@ from suturetrack.types import Float64, Image, Status
 _COLORS = {Status.TRACKING: "#2ca84a", Status.OCCLUDED: "#e6a023", Status.LOST: "#d63a2f"}
 _LINES = ("#2f6fd0", "#d9702b", "#8a4fc4")
 _MOST_LOSSES = 6
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM = 1000, 180, 64, 22
+_WIDTH, _HEIGHT, _LEFT, _TOP, _BOTTOM = 1000, 180, 64, 6, 22
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2rem auto; color: #222; }
 pre { font-size: 12.5px; line-height: 1.25; overflow-x: auto; }
@@ -97,7 +97,8 @@ def _plot(title: str, course: Course, lines: dict[str, Float64]) -> str:
         f"<text x='{_WIDTH}' y='{_HEIGHT - 2}' text-anchor='end'>frame {last}</text>",
     ]
     heading = f"<h3>{title}{_key(colors.items())}</h3>"
-    return f"{heading}<svg viewBox='0 0 {_WIDTH} {_HEIGHT}'>{''.join(drawn)}</svg>"
+    box = f"0 {-_TOP} {_WIDTH} {_TOP + _HEIGHT}"  # room for half a label above the uppermost value
+    return f"{heading}<svg viewBox='{box}'>{''.join(drawn)}</svg>"
 
 
 def _key(colors: Iterable[tuple[str, str]]) -> str:
@@ -134,7 +135,8 @@ def _ticks(low: float, high: float) -> list[float]:
     raw = (high - low) / 5
     power = 10.0 ** np.floor(np.log10(raw))
     step = next(m * power for m in (1, 2, 5, 10) if m * power >= raw)
-    return [round(k * step, 12) for k in range(int(np.ceil(low / step)), int(high / step) + 1)]
+    first, last = np.ceil(low / step), np.floor(high / step)
+    return [round(k * step, 12) for k in range(int(first), int(last) + 1)]
 
 
 def _key_frames(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,8 @@ from suturetrack.types import (
 )
 
 T, HIDDEN, LOST = Status.TRACKING, Status.OCCLUDED, Status.LOST
+DIGIT = 8
+"""Height of a digit in a plot, px."""
 COURSE = [T, T, T, HIDDEN, LOST, LOST, T, T, LOST, T]
 """Of frames 5, 7, 9, ..., 23 of a run of 30 frames."""
 
@@ -117,6 +120,9 @@ def test_the_page_holds_plots_and_key_frames_and_needs_nothing_else(
     for moment in ("5: initialisation", "11: the worst frame", "13: lost", "21: lost"):
         assert f"Frame {moment}" in text
     assert text.count("<img alt='' src='data:image/jpeg;base64,") == 4
+    for top, plot in re.findall(r"<svg viewBox='0 (\S+) (.*?)</svg>", text):
+        baselines = [float(y) for y in re.findall(r"<text x='58' y='(\S+)'", plot)]
+        assert min(baselines) - DIGIT >= float(top)
     outside = text.replace("data:image/jpeg", "").replace("http://www.w3.org", "")
     assert "http" not in outside
     assert "<script" not in text
