@@ -21,6 +21,7 @@ def opened(output: Path | None) -> Iterator[TextIO]:
 
     Raises:
         InputError: it cannot be written.
+        BrokenPipeError: who read a pipe has seen enough.
     """
     if output is None:
         yield sys.stdout
@@ -29,6 +30,8 @@ def opened(output: Path | None) -> Iterator[TextIO]:
         is_new = not output.exists()
         with _whole(output) if is_new or output.is_file() else _straight(output) as file:
             yield file
+    except BrokenPipeError:
+        raise
     except OSError as error:
         raise InputError(f"cannot write {output}: {error.strerror}") from error
 

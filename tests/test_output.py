@@ -58,6 +58,14 @@ def test_a_pipe_stays_one_and_is_written_to(tmp_path: Path, linked: bool) -> Non
     assert read == ["through"]
 
 
+def test_a_reader_that_has_seen_enough_of_a_pipe_is_no_fault(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.fdopen(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK))
+    with pytest.raises(BrokenPipeError), opened(pipe) as out, reader:
+        out.write("for whoever reads on")
+
+
 def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     for output, reason in (
         (tmp_path, "Is a directory"),
