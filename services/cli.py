@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 
+from services import RUST_LOG
+
 # Each process keeps to one core: they run side by side, and results do not depend on the machine.
 _ONE_THREAD = (
     "OMP_NUM_THREADS",
@@ -24,9 +26,7 @@ for _name in _ONE_THREAD:
 # What is wrong with a video is said once, by us.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-# Rerun warns of every file without a footer, which ours are on purpose; what Zenoh says of messages
-# that reach a session before it is complete is counted by our readers.
-os.environ.setdefault("RUST_LOG", "error,zenoh::api::session=off")
+os.environ.setdefault("RUST_LOG", RUST_LOG)
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,6 @@ def _dds_name(kind: str) -> str:
 
 
 def _open(router: str) -> Session:
-    zenoh.init_log_from_env_or("error")
     config = zenoh.Config()
     settings = {
         "mode": "client",

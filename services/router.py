@@ -11,6 +11,7 @@ from types import FrameType
 
 import zenoh
 
+from services import RUST_LOG
 from services.zenoh_transport import endpoints, explain, load_config
 from suturetrack.types import InputError
 
@@ -35,7 +36,7 @@ def run(config: RouterConfig) -> None:
         settings.insert_json5("listen/endpoints", '["tcp/127.0.0.1:7447"]')
     elif json.loads(settings.get_json("mode")) != "router":
         raise InputError(f'zenoh {config.zenoh}: a router needs mode: "router"')
-    zenoh.init_log_from_env_or("error")
+    zenoh.init_log_from_env_or(RUST_LOG)
     stop = threading.Event()
 
     def handler(number: int, frame: FrameType | None) -> None:

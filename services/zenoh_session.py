@@ -17,6 +17,8 @@ from typing import Any, TypeVar
 
 import zenoh
 
+from services import RUST_LOG
+
 T = TypeVar("T")
 
 _LONGEST_CALL_S = 1.0
@@ -33,6 +35,7 @@ class Session:
     """
 
     def __init__(self, config: zenoh.Config):
+        zenoh.init_log_from_env_or(RUST_LOG)
         self._kept: list[Any] = []
         self._threads: set[threading.Thread] = set()
         self.zenoh = _beside(lambda: zenoh.open(config))

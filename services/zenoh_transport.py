@@ -167,7 +167,6 @@ class ZenohTransport:
         shares: bool = True,
         waits: bool = True,
     ):
-        zenoh.init_log_from_env_or("error")
         if not waits and _is_client(config):
             config.insert_json5("connect/timeout_ms", str(_ROUTER_MS))
         try:

@@ -30,6 +30,14 @@ assert client.bus.wait_for_alive("tracker")
 assert steps.get(20) is not None
 print("heard", flush=True)
 """
+NEWCOMER = """
+from services import topics
+from services.client import connect
+for _ in range(100):
+    with connect("test") as client:
+        assert client.bus.every(topics.STEP).get(20) is not None
+print("heard", flush=True)
+"""
 ENDS = {
     "": (0, ""),
     "raise ValueError('my own')": (1, "ValueError: my own"),
@@ -49,7 +57,7 @@ def talker(rig_name: str) -> Iterator[None]:
     bus.declare_alive()
 
     def talk() -> None:
-        while not bus.stop.wait(0.002):
+        while not bus.stop.wait(0.0005):
             bus.publish(topics.STEP, Stamp(0, 0, 0))
 
     talking = threading.Thread(target=talk)
@@ -80,6 +88,15 @@ def test_a_program_that_closes_nothing_ends_with_its_own_words(talker: None) -> 
             assert program.returncode == status, (end, err)
             assert err.strip().endswith(last)
             assert "deaf" not in out
+
+
+def test_a_program_that_comes_into_a_busy_system_says_its_own_words_alone(
+    talker: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del talker
+    monkeypatch.delenv("RUST_LOG", raising=False)
+    with start(NEWCOMER) as program:
+        assert program.communicate(timeout=SOON_S) == ("heard\n", "")
 
 
 @pytest.fixture
