@@ -420,6 +420,26 @@ def test_an_end_that_springs_aside_is_taken_up_where_it_is(rig: StereoRig) -> No
         assert max(error(state, truths[-1]).ends) < 1.0
 
 
+@pytest.mark.parametrize(("angle", "place"), [(2.0, 530), (2.0, 540)])
+def test_an_end_that_springs_aside_is_taken_up_over_what_crosses_it(
+    rig: StereoRig, angle: float, place: int
+) -> None:
+    truth = thread(0.0)
+    aside = with_end_bent(truth, angle)
+    along = (aside[place + 5] - aside[place - 5]) / np.linalg.norm(
+        aside[place + 5] - aside[place - 5]
+    )
+    across = np.array([-along[1], along[0], 0.0])
+    lines = [aside[place] + 0.5 * i * along for i in (-1, 0, 1)]
+    band = [middle + np.linspace(-4, 4, 60)[:, None] * across for middle in lines]
+    fields = [paint(rig, [truth] if i < 36 else [aside, *band], i) for i in range(42)]
+    states = follow(fields, rig, seed_on(rig, truth))
+    assert states[35].status is Status.TRACKING
+    for state in states[39:]:
+        assert state.status is Status.TRACKING
+        assert max(error(state, aside).ends) < 1.0
+
+
 def test_an_end_does_not_spring_aside_onto_what_makes_the_thread_longer(rig: StereoRig) -> None:
     truth = thread(0.0)
     truths = [truth if i < 36 else with_end_bent(truth, 3.0, more=40) for i in range(40)]

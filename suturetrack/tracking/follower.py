@@ -26,7 +26,7 @@ from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.motion import Motion
 from suturetrack.tracking.mouth import Mouth
-from suturetrack.tracking.regrowth import regrown, unseen_tails
+from suturetrack.tracking.regrowth import loose_tails, regrown
 from suturetrack.tracking.reliability import (
     ASTRAY,
     RELIABILITY_SAMPLES,
@@ -343,10 +343,13 @@ class Follower:
     def _grow_ends_anew(
         self, images: Images, evidence: Evidence, neighbours: Neighbours
     ) -> Evidence:
-        """Every now and then, the ends that are not seen, where the thread plainly ends elsewhere."""
-        model, known, tails = self.model, self.known_length, unseen_tails(evidence)
+        """Every now and then, the ends that are not plain to see, where the thread plainly ends elsewhere."""
+        model, known = self.model, self.known_length
         rested_s = (model.capture_ns - self._regrown_ns) * _NS
-        if not (tails and known.is_established) or 0 <= rested_s < _REGROWN_S:
+        if not known.is_established or 0 <= rested_s < _REGROWN_S:
+            return evidence
+        tails = loose_tails(evidence.astray(images, neighbours)[1])
+        if not tails:
             return evidence
         self._regrown_ns = model.capture_ns
         fitted = partial(self._fitted, images, others=neighbours.shown_in(images))

@@ -1,4 +1,4 @@
-"""Ends that are not seen where they should be, grown anew along the ridge from where the thread is seen."""
+"""Ends that are not plain to see, grown anew along the ridge from where the thread is."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Evidence, loose_ends
 from suturetrack.tracking.sampling import length_of
-from suturetrack.types import Nurbs
+from suturetrack.types import Bool, Nurbs
 
 # Samples that have to be unseen at an end, and that may be at most. One beside them may have left the
 # thread as well.
 _FEW, _MANY, _BESIDE = 2, 20, 1
 # How often an end is drawn out, at most, and by how much at least to be drawn out once more.
 _STEPS, _LEAST_PX = 8, 2.0
+# By how much it is drawn out over what crosses the thread.
+_LEAP_PX = 12.0
 
 
-def unseen_tails(evidence: Evidence) -> dict[int, int]:
-    """By end, 0 or 1, how many of the evenly spaced samples there are not seen, where it is a few."""
-    counts = loose_ends(~evidence.evenly_seen)
+def loose_tails(plain: Bool) -> dict[int, int]:
+    """By end, 0 or 1, how many of the evenly spaced samples there are not plainly on the thread, where it
+    is a few."""
+    counts = loose_ends(~plain)
     return {end: count for end, count in enumerate(counts) if _FEW <= count <= _MANY}
 
 
@@ -35,21 +38,21 @@ def regrown(
 ) -> Evidence | None:
     """The curve with an end elsewhere; None where what is not seen of its ends may be hidden.
 
-    An end that is let go springs aside, and what is left of the curve there points nowhere. It is not
-    hidden if the thread plainly goes on from where it is seen, with nothing beside it, and is as long
-    as ever that way.
+    An end that is let go springs aside, and what is left of the curve there points nowhere, or lies on
+    another strand of it. It is not hidden if the thread plainly goes on from where it is seen, with
+    nothing beside it, and is as long as ever that way.
 
     Args:
         curve: as its ends are now.
-        tails: of `unseen_tails`.
+        tails: of `loose_tails`.
         known: what is known of the thread's length.
         images: what shows the thread.
         fitted: lays a curve on the field.
     """
     found = None
-    for end, unseen in tails.items():
-        other = _grown(_without(curve, end, unseen + _BESIDE), end, images, fitted)
-        if other is not None and _is_plain(other, end, unseen, known):
+    for end, loose in tails.items():
+        other = _grown(_without(curve, end, loose + _BESIDE), end, images, fitted)
+        if other is not None and _is_plain(other, end, loose, known):
             found, curve = other, other.fit.curve
     return found
 
@@ -65,16 +68,20 @@ def _grown(
     images: Images,
     fitted: Callable[[Nurbs], Evidence],
 ) -> Evidence | None:
-    """The curve drawn out along the ridge at an end, None if there is none."""
+    """The curve drawn out along the ridge at an end, and over what crosses it; None if there is none."""
     evidence = None
+    step = find_end(curve, end, images)
     for _ in range(_STEPS):
-        step = find_end(curve, end, images)
-        if step is None or step.offset_px < _LEAST_PX:
+        if step is None:
             break
-        start, stop = (0.0, step.offset) if end else (step.offset, 0.0)
-        curve, _, _ = rearrange(with_ends(curve, -start, 1.0 + stop), images.rig)
-        evidence = fitted(curve)
-        curve = evidence.fit.curve
+        is_leap = step.offset_px < _LEAST_PX
+        ahead = step.pixel * (_LEAP_PX if is_leap else step.offset_px)
+        start, stop = (0.0, ahead) if end else (ahead, 0.0)
+        longer = fitted(rearrange(with_ends(curve, -start, 1.0 + stop), images.rig)[0])
+        step = find_end(longer.fit.curve, end, images)
+        if is_leap and (step is None or step.offset_px < -_LEAST_PX):
+            break
+        evidence, curve = longer, longer.fit.curve
     return evidence
 
 
