@@ -14,6 +14,7 @@ from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, initialize
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
+from suturetrack.tracking.clearness import Clearness
 from suturetrack.tracking.control_points import rearrange, refit
 from suturetrack.tracking.drift import Drift
 from suturetrack.tracking.energies import measure_levels
@@ -125,6 +126,32 @@ def test_a_thread_that_was_taken_elsewhere_while_it_was_lost_is_found_by_its_len
         assert error(states[-1], there).rms < 0.1
     else:
         assert all(state.status is not Status.TRACKING for state in states[22:])
+
+
+@pytest.mark.parametrize("away", [85, 95, 105])
+def test_a_thread_that_was_away_for_long_is_found_as_soon_as_it_is_clear(
+    rig: StereoRig, away: int
+) -> None:
+    """It is looked for but once a second by then."""
+    here = thread(0.0, 60.0) - [0, 15, 0]
+    there = thread(0.0, 60.0)[:, [1, 0, 2]] + [-15, 28, 0]
+    shown = [here] * 10 + [None] * away + [there] * 12
+    fields = [paint(rig, [] if points is None else [points], i) for i, points in enumerate(shown)]
+    states = follow(fields, rig, seed_on(rig, here))
+    back = 10 + away
+    assert all(state.status is Status.LOST for state in states[20:back])
+    (found,) = [i for i, state in enumerate(states) if "found again" in state.events]
+    assert found - back < 0.1 * FPS
+    assert all(state.status is Status.TRACKING for state in states[found:])
+
+
+def test_what_stays_clear_is_not_taken_for_a_lost_thread_that_is_back(rig: StereoRig) -> None:
+    clearness, back = Clearness(), []
+    for i, is_shown in enumerate([1, 0, 0, 1, 1, 1, 1, 1, 0, 1]):
+        field = paint(rig, [thread(0.0)] if is_shown else [], i)
+        clearness.step(field, (0.8, 0.8), is_lost=i > 0)
+        back.append(clearness.is_back)
+    assert back == [False, False, False, True, True, True, False, False, False, True]
 
 
 @pytest.mark.parametrize("away_s", [0.1, 1.0, 2.0])

@@ -17,6 +17,7 @@ from suturetrack.initialization import (
 from suturetrack.kernels import search
 from suturetrack.metrics import polyline_distances, polyline_length
 from suturetrack.nurbs import evaluate, reversed_curve, tangents
+from suturetrack.tracking.clearness import clear
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.length import has_length, length_error
@@ -34,8 +35,8 @@ _SAME = 0.9
 _EVENLY = np.linspace(0, 1, 4 * _PLACES)
 # How near and for how long an end may run along another thread, and what more leaves of the confidence.
 _BESIDE_PX, _LONGEST_PX, _DOUBTED = 5.0, 12.0, 0.3
-# What is as clear as the thread, of its own response, and how closely its length is met elsewhere.
-_AS_CLEAR, _CLOSELY = 0.7, 0.01
+# How closely its length is met elsewhere.
+_CLOSELY = 0.01
 # How near to a seed a thread passes that runs along the other one there, for a while.
 _MEETS_PX = 25.0
 
@@ -123,8 +124,7 @@ def find_elsewhere(
     Nothing but its length tells that it is the thread, so that has to be known, and met closely by a
     look that is sure by itself.
     """
-    shown = np.linalg.norm(field.left, axis=2) > _AS_CLEAR * level
-    places = np.argwhere(shown)[:, ::-1]
+    places = np.argwhere(clear(field.left, level))[:, ::-1]
     if not (len(places) and known_lengths):
         return None
     place = places[np.random.default_rng(field.stamp.frame).integers(len(places))]

@@ -11,6 +11,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.metrics import nearest_index
 from suturetrack.nurbs import evaluate
+from suturetrack.tracking.clearness import Clearness
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import has_length
@@ -76,6 +77,7 @@ class Thread:
         self._is_seed_shared = False
         """Whether another thread may be meant: no look can tell."""
         self._fields_to_rest = self._attempts = self._looks_in_vain = 0
+        self._clearness = Clearness()
 
     def seek(self, seed: Seed) -> None:
         """Has the thread looked for from a seed; until it is found there, it is held where it is."""
@@ -134,6 +136,8 @@ class Thread:
             self._state = replace(self._state, events=())
             return
         state = self._pursuit.step(field, others)
+        levels = self._pursuit.follower.model.levels
+        self._clearness.step(field, levels, is_lost=state.status is Status.LOST)
         if state.status is not Status.LOST and was_lost:
             state = replace(state, events=("recovered", *state.events))
         elif state.status is Status.LOST and not was_lost:
@@ -192,11 +196,13 @@ class Thread:
         return FromSeed(self._sought, self._setup, self._state.curve)
 
     def _search_again(self, is_beside: bool) -> Search | None:
-        if self._fields_to_rest > 0:
+        if self._fields_to_rest <= 0:
+            self._fields_to_rest = _REST << min(max(self._attempts - _QUICK_ATTEMPTS, 0), _RAREST)
+            self._attempts += 1
+        else:
             self._fields_to_rest -= 1
-            return None
-        self._fields_to_rest = _REST << min(max(self._attempts - _QUICK_ATTEMPTS, 0), _RAREST)
-        self._attempts += 1
+            if not self._clearness.is_back:
+                return None
         turn = self._attempts - 1 if is_beside else None
         if self.follower is not None:
             held, knows = self.follower, self._looks_in_vain < _LOOKS
