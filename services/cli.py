@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import importlib
 import logging
 import os
@@ -84,8 +85,13 @@ def main() -> None:
     try:
         status = call(arguments)
         sys.stdout.flush()
-    except BrokenPipeError:
-        # Who read has seen enough, as `| head` does; the interpreter would complain once more at exit.
+    except OSError as error:
+        # Who read has seen enough, as `| head` does.
+        if error.errno not in (errno.EPIPE, errno.ENOSPC):
+            raise
+        if error.errno == errno.ENOSPC:
+            print(f"suturetrack: cannot write: {error.strerror}", file=sys.stderr)
+        # The interpreter would complain once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = 1
     if arguments and arguments[0] in VERBS and VERBS[arguments[0]].process:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from services.arguments import metres
 from services.client import Client, Refused, Seen, connect
 from suturetrack.grasping import AWAY_FROM_CAMERA
-from suturetrack.types import Grasp
+from suturetrack.types import Grasp, InputError
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,9 @@ def run(config: GraspConfig) -> None:
     Raises:
         InputError: no system runs, the place is wrong, or, unless watching, the grasp is refused.
     """
+    places = config.from_end, config.from_start, config.fraction, config.near
+    if sum(place is not None for place in places) != 1:
+        raise InputError("where? use one of --from-end, --from-start, --fraction and --near")
     from_start, from_end = (
         None if v is None else metres(v) for v in (config.from_start, config.from_end)
     )
