@@ -48,7 +48,7 @@ def run(config: GraspConfig) -> None:
     """
     places = config.from_end, config.from_start, config.fraction, config.near
     if sum(place is not None for place in places) != 1:
-        raise InputError("where? use one of --from-end, --from-start, --fraction and --near")
+        raise InputError("give exactly one of --from-end, --from-start, --fraction and --near")
     from_start, from_end = (
         None if v is None else metres(v) for v in (config.from_start, config.from_end)
     )

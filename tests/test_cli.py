@@ -274,9 +274,3 @@ def test_a_full_disk_behind_the_output_is_said_in_one_line(tmp_path: Path, argum
         out = subprocess.run(command, cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True)
     assert out.returncode == 1
     assert out.stderr == "suturetrack: cannot write: No space left on device\n"
-
-
-@pytest.mark.parametrize("places", [(), ("--fraction", "0.5", "--from-end", "10mm")])
-def test_a_grasp_asks_for_one_place(call: Call, places: tuple[str, ...]) -> None:
-    told = complaint(call("grasp", *places))
-    assert told.endswith("use one of --from-end, --from-start, --fraction and --near\n")
