@@ -414,6 +414,31 @@ def test_a_shaken_thread_that_bends_little_where_it_is_hidden_is_tracked(
         assert error(state, truth).rms < 0.5
 
 
+@pytest.mark.parametrize("start_s", [0.0, 0.7, 1.5])
+def test_an_edge_that_draws_a_bow_straight_is_not_called_tracking(
+    rig: StereoRig, start_s: float
+) -> None:
+    first, last = 210, 390
+    truths = [thread(start_s + i / FPS / 3) for i in range(45)]
+    drawn = np.clip((np.arange(45) - 20) / 8, 0, 1) * (np.arange(45) < 36)
+    fields = []
+    for i, (points, share) in enumerate(zip(truths, drawn, strict=True)):
+        shows, ends = points.copy(), points[[first, last]]
+        chord = ends[0] + np.linspace(0, 1, last - first + 1)[:, None] * (ends[1] - ends[0])
+        shows[first : last + 1] += share * (chord - points[first : last + 1])
+        hidden = [(u, v, 8.0) for u, v in rig.project(ends)[0]]
+        fields.append(paint(rig, [shows], i, hidden if share else []))
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    assert all(state.status is Status.TRACKING for state in states[:20] + states[40:])
+    taken_for_it = [
+        state
+        for state, truth in list(zip(states, truths, strict=True))[28:36]
+        if error(state, truth).largest > 3.0
+    ]
+    assert len(taken_for_it) >= 4
+    assert all(state.status is Status.OCCLUDED for state in taken_for_it)
+
+
 def test_a_hidden_end_is_held_and_taken_up_again(rig: StereoRig) -> None:
     truths = [thread(i / FPS) for i in range(36)]
     fields = []

@@ -12,6 +12,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.tracking import gauss_newton, paper
 from suturetrack.tracking.alignment import shifted, shown
+from suturetrack.tracking.bends import Bends
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.control_points import rearrange
 from suturetrack.tracking.crowding import covered
@@ -91,6 +92,7 @@ class Follower:
         """When it was certain last where the thread runs, and for a moment before."""
         self._doubted_ns = self._regrown_ns = self._led_back_ns = -(1 << 62)
         self._drift = Drift()
+        self._bends = Bends()
         self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
         self._share_seen = 1.0
@@ -175,7 +177,8 @@ class Follower:
         model, drift = self.model, self._drift
         self._hidden.step(evidence.evenly_hidden & ~drift.outside, model.capture_ns)
         wrong, uncertain_s = self._wrong(evidence, astray, plain, seconds)
-        status = self._status(evidence, plain, uncertain_s)
+        is_kinked = self._bends.step(model.curve, evidence.evenly_seen, seconds)
+        status = self._status(evidence, plain, uncertain_s, is_kinked)
         self._lost = status is Status.LOST
         if status is Status.TRACKING:
             self.last_good = model.curve
@@ -215,7 +218,9 @@ class Follower:
             self._certain_ns = model.capture_ns
         return wrong, (model.capture_ns - self._certain_ns) * _NS
 
-    def _status(self, evidence: Evidence, plain: Bool, uncertain_s: float) -> Status:
+    def _status(
+        self, evidence: Evidence, plain: Bool, uncertain_s: float, is_kinked: bool
+    ) -> Status:
         """The status; a curve that was lost must have its length again, and be seen, to be held."""
         model, known, noise = self.model, self.known_length, evidence.length_noise
         length = length_of(model.curve)
@@ -228,7 +233,7 @@ class Follower:
         if self._lost and (is_another or plain.mean() < 1 - ASTRAY):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
-        is_vague = self._drift.gone.mean() > ASTRAY
+        is_vague = is_kinked or self._drift.gone.mean() > ASTRAY
         is_vague |= any(self._hidden.for_longer_than(_HIDDEN_S))
         is_vague |= bool(self._leaps.any()) and not known.is_reached(length)
         is_vague |= bool(np.sqrt(np.mean(evidence.sigma**2)) > _VAGUE * length)
@@ -257,6 +262,7 @@ class Follower:
         last = RELIABILITY_SAMPLES - 1
         self.model.curve = nurbs.part(self.model.curve, start / last, 1 - stop / last)
         self._drift.cut(start, stop)
+        self._bends = Bends()
 
     def _start_again(self) -> None:
         """Looks from where the thread was last held, from the next field on."""
