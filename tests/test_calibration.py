@@ -131,6 +131,15 @@ def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path, content: bytes
         load_calibration(tmp_path / "rig.yaml")
 
 
+@pytest.mark.parametrize("entry", ["fisheye", "Equidistant", "4"])
+def test_an_unknown_lens_model_is_not_taken_for_a_radial_one(tmp_path: Path, entry: str) -> None:
+    four = np.zeros((1, 4))
+    path = write(tmp_path / "rig.yaml", D1=four, D2=four)
+    path.write_text(f"{path.read_text()}distortion_model: {entry}\n")
+    with pytest.raises(InputError, match=r"rig\.yaml: distortion_model is .* use equidistant"):
+        load_calibration(path)
+
+
 def test_a_missing_file_and_an_unknown_unit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no file"):
         load_calibration(tmp_path / "none.yaml")

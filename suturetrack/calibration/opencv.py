@@ -13,7 +13,9 @@ from suturetrack.types import Float64, InputError
 
 _SHAPES = {"K1": (3, 3), "K2": (3, 3), "R": (3, 3), "D1": None, "D2": None, "T": None}
 _MODEL = "distortion_model"
-"""An entry of our own: "equidistant" where D1 and D2 are those of `cv2.fisheye`."""
+"""An entry of our own: which functions of OpenCV D1 and D2 belong to."""
+_IS_FISHEYE = {"equidistant": True, "plumb_bob": False, "rational_polynomial": False}
+"""By ROS's names of the models; without the entry it is none of `cv2.fisheye`."""
 
 
 def read(path: Path, unit: str | None, where: str) -> StereoRig:
@@ -25,8 +27,7 @@ def read(path: Path, unit: str | None, where: str) -> StereoRig:
     try:
         entries = {name: _matrix(storage, name, where, shape) for name, shape in _SHAPES.items()}
         size = _image_size(storage, where)
-        model = storage.getNode(_MODEL)
-        fisheye = not model.empty() and model.string() == "equidistant"
+        fisheye = _is_fisheye(storage, where)
     finally:
         storage.release()
     if size.size != 2 or (size != np.rint(size)).any():
@@ -61,6 +62,19 @@ def save_calibration(path: Path | str, rig: StereoRig) -> None:
     if rig.left.fisheye:
         storage.write(_MODEL, "equidistant")
     storage.release()
+
+
+def _is_fisheye(storage: cv2.FileStorage, where: str) -> bool:
+    node = storage.getNode(_MODEL)
+    if node.empty():
+        return False
+    model = node.string() if node.isString() else "no word"
+    if model not in _IS_FISHEYE:
+        raise InputError(
+            f"{where}: {_MODEL} is {model}; use equidistant where D1 and D2 are of cv2.fisheye, "
+            "else plumb_bob or rational_polynomial"
+        )
+    return _IS_FISHEYE[model]
 
 
 def _image_size(storage: cv2.FileStorage, where: str) -> Float64:
