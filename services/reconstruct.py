@@ -12,7 +12,7 @@ import tyro
 
 from services.output import opened
 from services.sources.exposure import exposure_fault
-from services.sources.footage import halves, read_image
+from services.sources.footage import check_pair, halves, read_image
 from services.sources.rig import check_size, open_rig
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
@@ -131,19 +131,9 @@ def _load(config: ReconstructConfig) -> tuple[Image, Image]:
 
 
 def _check(left: Image, right: Image, rig: StereoRig) -> None:
-    if left.ndim != right.ndim:
-        raise InputError("one image is gray and the other in colour; both must be alike")
-    if left.shape != right.shape:
-        raise InputError(
-            f"the images differ in size: left {_size(left)}, right {_size(right)}; "
-            "give a pair of one camera setting"
-        )
+    check_pair(left, right, "the images")
     check_size((left.shape[1], left.shape[0]), rig, "the images", "the calibration")
     for name, image in (("left", left), ("right", right)):
         fault = exposure_fault(image)
         if fault:
             raise InputError(f"the {name} image is {fault}")
-
-
-def _size(image: Image) -> str:
-    return f"{image.shape[1]}x{image.shape[0]}"

@@ -144,7 +144,7 @@ def test_a_camera_that_gives_nothing_or_the_wrong_thing_is_refused(
     with pytest.raises(InputError, match="--calibration FILE is needed"):
         open_input(InputConfig("0"))
     devices.images[1] = picture(0, 0)[:200]
-    with pytest.raises(InputError, match=r"left is \(240, 640, 3\), right is \(200, 320, 3\)"):
+    with pytest.raises(InputError, match=r"left is 640x240 in colour, right is 320x200"):
         open_input(InputConfig("0,1", calibration))
     devices.stalled.set()
     with pytest.raises(InputError, match=r"camera 0: no image for \d s; is it connected, and free"):

@@ -147,8 +147,14 @@ def cut(suffix: str) -> bytes:
     ("wrong", "reason"),
     [
         (np.zeros((HEIGHT, WIDTH), np.uint16), "uint16; convert it to 8 bit"),
-        (np.zeros((HEIGHT, WIDTH), np.uint8), r"is \(240, 320, 3\).*is \(240, 320\)"),
-        (np.zeros((HEIGHT, WIDTH // 2, 3), np.uint8), r"is \(240, 160, 3\)"),
+        (
+            np.zeros((HEIGHT, WIDTH), np.uint8),
+            "left is 320x240 in colour, right is 320x240 gray; both must",
+        ),
+        (
+            np.zeros((HEIGHT, WIDTH // 2, 3), np.uint8),
+            "left is 320x240 in colour, right is 160x240 in",
+        ),
         (b"no image", "cannot be read"),
         (b"", "cannot be read"),
         (cut(".png"), "cut short"),
@@ -168,6 +174,14 @@ def test_a_wrong_image_in_the_middle_is_named(
     refused(tmp_path / "pairs", calibration, rf"0002\.png.*{reason}|{reason}")
 
 
+def test_a_pair_of_another_size_in_the_middle_is_named(tmp_path: Path, calibration: Path) -> None:
+    write_folder(tmp_path / "pairs")
+    for side in ("left", "right"):
+        cv2.imwrite(str(tmp_path / "pairs" / side / "0002.png"), np.zeros((120, 160, 3), np.uint8))
+    words = r"0002\.png is 160x120, the first one was 320x240; keep images of one size"
+    refused(tmp_path / "pairs", calibration, words)
+
+
 def test_views_of_another_size_than_the_calibration_are_refused(
     tmp_path: Path, calibration: Path
 ) -> None:
@@ -180,7 +194,11 @@ def test_videos_that_do_not_match_are_refused(tmp_path: Path, calibration: Path)
     write_video(tmp_path / "b.avi", [picture(0, 1)], fps=30)
     write_video(tmp_path / "c.avi", [both(0)], fps=20)
     refused(f"{tmp_path / 'a.avi'},{tmp_path / 'b.avi'}", calibration, "20 and 30 frames/s")
-    refused(f"{tmp_path / 'a.avi'},{tmp_path / 'c.avi'}", calibration, "the other")
+    refused(
+        f"{tmp_path / 'a.avi'},{tmp_path / 'c.avi'}",
+        calibration,
+        "left is 320x240 .*, right is 640x240",
+    )
 
 
 @pytest.mark.parametrize("kept", [0.5, 1.0])

@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
-from services.sources.footage import Exposure
+from services.sources.footage import Exposure, check_pair
 from services.sources.pairing import (
     Pair,
     Pairing,
@@ -119,8 +119,7 @@ class BagFootage:
     def _decode(self, pair: Pair[_Raw]) -> Exposure:
         sides = pair.left, pair.right
         left, right = (decode(self._open(raw), raw.connection.topic) for raw in sides)
-        if left.shape != right.shape:
-            raise InputError(f"{self._where}: left is {left.shape}, right is {right.shape}")
+        check_pair(left, right, self._where)
         return Exposure(pair.stamp_ns, left, right, skipped=pair.skipped)
 
     def _pairs(self) -> Iterator[Pair[_Raw]]:

@@ -7,7 +7,7 @@ import time
 
 import cv2
 
-from services.sources.footage import Exposure, Stalled, halves
+from services.sources.footage import Exposure, Stalled, check_pair, halves
 from services.sources.live import STALL_S, Newest
 from suturetrack.types import Image, InputError
 
@@ -118,8 +118,7 @@ class CameraFootage:
                 return None
             images.append(image)
         left, right = images if len(images) == 2 else halves(images[0], self._names[0])
-        if left.shape != right.shape:
-            raise InputError(f"cameras: left is {left.shape}, right is {right.shape}")
+        check_pair(left, right, "cameras")
         return Exposure(now_ns, left, right)
 
     def _open(self) -> list[cv2.VideoCapture]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.sources.footage import Exposure, read_image
+from services.sources.footage import Exposure, check_pair, read_image
 from suturetrack.types import InputError
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -29,10 +29,13 @@ class FolderFootage:
             return None
         paths = self._pairs[index]
         left, right = (read_image(path) for path in paths)
-        if left.shape != right.shape:
-            raise InputError(f"{paths[0]} is {left.shape}, {paths[1]} is {right.shape}")
-        if (left.shape[1], left.shape[0]) != self.size:
-            raise InputError(f"{paths[0]} is {left.shape}, the first image was {self.size}")
+        check_pair(left, right, f"images {paths[0]} and {paths[1]}")
+        width, height = left.shape[1], left.shape[0]
+        if (width, height) != self.size:
+            raise InputError(
+                f"image {paths[0]} is {width}x{height}, the first one was "
+                f"{self.size[0]}x{self.size[1]}; keep images of one size in a folder"
+            )
         return Exposure(round(index * 1e9 / self.fps), left, right)
 
     def close(self) -> None:

@@ -80,6 +80,19 @@ def read_image(path: Path) -> Image:
     return np.ascontiguousarray(image[..., :3]) if image.ndim == 3 else image
 
 
+def check_pair(left: Image, right: Image, where: str) -> None:
+    """Raises InputError when two images cannot be the views of one frame."""
+    if left.shape != right.shape:
+        raise InputError(
+            f"{where}: left is {_spell(left)}, right is {_spell(right)}; both must have one size, and "
+            "be gray or in colour alike"
+        )
+
+
+def _spell(image: Image) -> str:
+    return f"{image.shape[1]}x{image.shape[0]} {'gray' if image.ndim == 2 else 'in colour'}"
+
+
 def halves(image: Image, name: str) -> tuple[Image, Image]:
     """The left and the right view of a side-by-side image; raises InputError."""
     width = image.shape[1]

@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 from services.ros2_graph import RosConfig, RosNode
-from services.sources.footage import Exposure, Stalled
+from services.sources.footage import Exposure, Stalled, check_pair
 from services.sources.live import STALL_S, Newest
 from services.sources.pairing import Pairing, camera_info_topic, is_rectified_topic, rate_of
 from services.sources.ros_image import (
@@ -124,8 +124,7 @@ class Ros2Footage:
             sides = pair.left, pair.right
             try:
                 left, other = (decode(m, t) for m, t in zip(sides, self.topics, strict=True))
-                if left.shape != other.shape:
-                    raise InputError(f"{self._where}: left is {left.shape}, right {other.shape}")
+                check_pair(left, other, self._where)
             except InputError as error:
                 self._newest.fail(error)
             else:

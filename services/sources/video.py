@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 
-from services.sources.footage import Exposure, halves
+from services.sources.footage import Exposure, check_pair, halves
 from suturetrack.types import Image, InputError
 
 
@@ -66,8 +66,7 @@ class VideoFootage:
                 raise InputError(f"source {path}: frame {index} cannot be decoded")
             images.append(image)
         left, right = images if len(images) == 2 else halves(images[0], str(self._paths[0]))
-        if left.shape != right.shape:
-            raise InputError(f"source: {self._paths[0]} is {left.shape}, the other {right.shape}")
+        check_pair(left, right, f"source {','.join(map(str, self._paths))}")
         return Exposure(round(index * 1e9 / self.fps), left, right)
 
 
