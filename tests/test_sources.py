@@ -91,6 +91,27 @@ def test_frames_come_in_order_with_the_recordings_own_time(footage: Footage) -> 
     assert footage.read(COUNT) is None
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"frame {i + 8}" for i in range(COUNT)],
+        ["1700000099.5", *(f"1700000100.{s}" for s in ("05", "1", "25", "3", "6"))],
+    ],
+    ids=["counted", "seconds"],
+)
+def test_images_of_a_folder_come_in_the_order_of_their_numbers(
+    tmp_path: Path, calibration: Path, names: list[str]
+) -> None:
+    write_folder(tmp_path / "pairs")
+    for path in list(tmp_path.glob("pairs/*/*.png")):
+        path.rename(path.with_name(f"{names[int(path.stem)]} {path.parent.name}.png"))
+    footage = open_footage(tmp_path / "pairs", calibration)
+    for i in range(COUNT):
+        exposure = footage.read(i)
+        assert exposure is not None
+        assert (told(exposure.left), told(exposure.right)) == ((i, 0), (i, 1))
+
+
 def test_frames_can_be_left_out(footage: Footage) -> None:
     for i in (0, 3, 5):
         exposure = footage.read(i)

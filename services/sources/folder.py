@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from services.sources.footage import Exposure, check_pair, read_image
@@ -49,10 +50,17 @@ def _pairs(folder: Path) -> list[tuple[Path, Path]]:
             raise InputError(
                 f"source {folder}: no folder {side}/; it needs left/*.png, right/*.png"
             )
-        views.append(sorted(p for p in (folder / side).iterdir() if p.suffix.lower() in _SUFFIXES))
+        images = [p for p in (folder / side).iterdir() if p.suffix.lower() in _SUFFIXES]
+        views.append(sorted(images, key=_order))
     left, right = views
     if not left or not right:
         raise InputError(f"source {folder}: no images in left/ or right/")
     if len(left) != len(right):
         raise InputError(f"source {folder}: {len(left)} images in left/, {len(right)} in right/")
     return list(zip(left, right, strict=True))
+
+
+def _order(path: Path) -> list[tuple[float, str]]:
+    """Sorts names by the numbers in them: 2 before 10, and 10.25 before 10.5."""
+    parts = re.findall(r"[0-9]+(?:\.[0-9]+)?|[^0-9]+", path.stem)
+    return [(float(part) if part[0] in "0123456789" else -1, part) for part in parts]
