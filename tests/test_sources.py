@@ -158,6 +158,20 @@ def test_a_folder_that_is_none_of_pairs_is_refused(tmp_path: Path, calibration: 
     refused(folder, calibration, "1 images in left/, 2 in right/")
 
 
+@pytest.mark.parametrize(("left", "right"), [("", ""), ("left_", "right_")])
+def test_a_folder_whose_sides_lack_different_images_is_refused(
+    tmp_path: Path, calibration: Path, left: str, right: str
+) -> None:
+    write_folder(tmp_path / "pairs")
+    (tmp_path / "pairs" / "left" / "0001.png").unlink()
+    (tmp_path / "pairs" / "right" / "0004.png").unlink()
+    for side, prefix in (("left", left), ("right", right)):
+        for path in list((tmp_path / "pairs" / side).iterdir()):
+            path.rename(path.with_name(prefix + path.name))
+    words = rf"left/{left}0002\.png would be paired with right/{right}0001\.png, not with right/{right}0002"
+    refused(tmp_path / "pairs", calibration, words)
+
+
 def cut(suffix: str) -> bytes:
     """An image file without its last tenth."""
     whole = cv2.imencode(suffix, picture(2, 1))[1].tobytes()

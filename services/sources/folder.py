@@ -57,6 +57,14 @@ def _pairs(folder: Path) -> list[tuple[Path, Path]]:
         raise InputError(f"source {folder}: no images in left/ or right/")
     if len(left) != len(right):
         raise InputError(f"source {folder}: {len(left)} images in left/, {len(right)} in right/")
+    partner = {path.stem.replace("right", "left"): path for path in right}
+    for path, other in zip(left, right, strict=True):
+        namesake = partner.get(path.stem, other)
+        if namesake != other:
+            raise InputError(
+                f"source {folder}: left/{path.name} would be paired with right/{other.name}, not with "
+                f"right/{namesake.name}; each side lacks an image that the other has: delete those"
+            )
     return list(zip(left, right, strict=True))
 
 
