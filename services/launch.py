@@ -26,6 +26,7 @@ from services.bus import Bus
 from services.checks import check_rig
 from services.fleet import Fleet, Launch
 from services.monitor import Monitor
+from services.output import command
 from services.service import ServiceConfig, SharedConfig
 from services.sources import InputConfig, open_input
 from services.zenoh_transport import (
@@ -104,7 +105,7 @@ def run(config: RunConfig | DemoConfig) -> None:
         config, rig = _resolve(config, rig_name)
         _make_run_folder(config, rig)
         console.print(_rig_line(rig))
-        console.print(f"Recording to {config.service.run_dir}")
+        console.print(f"Recording to {config.service.run_dir}", markup=False, soft_wrap=True)
         if not config.seed:
             console.print("No --seed U V: nothing is tracked until a seed is sent.")
         monitor = _watch(config, console, stack)
@@ -112,7 +113,8 @@ def run(config: RunConfig | DemoConfig) -> None:
         console.print(table)
     for warning in monitor.warnings():
         console.print(warning, markup=False, soft_wrap=True)
-    console.print(f"Open it with: suturetrack view {config.service.run_dir}")
+    opens = command("view", config.service.run_dir)
+    console.print(f"Open it with: {opens}", markup=False, soft_wrap=True)
 
 
 def _rig_line(rig: StereoRig) -> str:

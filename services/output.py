@@ -1,8 +1,9 @@
-"""Where a verb writes what it was asked for."""
+"""Where a verb writes what it was asked for, and what to type next."""
 
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,11 @@ from pathlib import Path
 from typing import TextIO
 
 from suturetrack.types import InputError
+
+
+def command(*words: object) -> str:
+    """A command of ours as a shell takes it, whatever the names of its files are."""
+    return shlex.join(("suturetrack", *map(str, words)))
 
 
 @contextmanager

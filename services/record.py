@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from services.live import PUBLISHERS, LiveView
+from services.output import command
 from services.recording import Recorder
 from services.service import Service, ServiceConfig
 from suturetrack.calibration import save_calibration
@@ -44,7 +45,7 @@ def run(service: Service, config: RecordConfig) -> None:
             service.warning = next((r.problem for r in recorders if r.problem), "")
             if any(recorder.fault for recorder in recorders):
                 raise InputError(service.warning)
-    print(f"Open it with: suturetrack view {folder}")
+    print(f"Open it with: {command('view', folder)}")
 
 
 def fresh_folder() -> Path:

@@ -23,6 +23,7 @@ from services.arguments import write_config
 from services.bus import Bus, NoAnswer
 from services.memory_transport import Hub
 from services.messages import Forget
+from services.output import command
 from services.recording import Recorder
 from services.run_folder import RunFolder
 from services.segmenter import SegmenterConfig
@@ -102,7 +103,7 @@ def run(config: ReplayConfig) -> None:
         raise InputError(f"run folder {new}: {error.strerror}") from error
     service = ServiceConfig(run_dir=new, recording=config.recording, lockstep=True)
     _replay(folder, parameters, service, config.from_)
-    print(f"Replayed to {new}; compare: suturetrack compare {config.run} {new}")
+    print(f"Replayed to {new}; compare: {command('compare', config.run, new)}")
 
 
 def changed(parameters: Parameters, changes: Iterable[str]) -> Parameters:

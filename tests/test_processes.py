@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import select
+import shlex
 import shutil
 import signal
 import subprocess
@@ -107,16 +108,18 @@ def test_a_run_in_lock_step_is_recorded_whole_and_leaves_nothing_behind(
     pairs: tuple[Path, tuple[float, float]],
     tmp_path: Path,
 ) -> None:
-    process = start(*run_pairs(pairs, tmp_path / "a"))
+    run_dir = tmp_path / "a run of the [/lab]"
+    process = start(*run_pairs(pairs, run_dir))
     out, err = process.communicate(timeout=90)
     assert process.returncode == 0, err
     assert "rate Hz" in out
-    assert f"suturetrack view {tmp_path / 'a'}" in out
+    assert f"Recording to {run_dir}\n" in out
+    assert shlex.split(out.splitlines()[-1])[-3:] == ["suturetrack", "view", str(run_dir)]
     assert not list(Path(os.environ["XDG_RUNTIME_DIR"]).rglob("*.*"))
-    assert (tmp_path / "a" / "config.toml").read_text().count("lockstep = true") == 1
+    assert (run_dir / "config.toml").read_text().count("lockstep = true") == 1
     original = (pairs[0] / "calibration.yaml").read_bytes()
-    assert (tmp_path / "a" / "calibration.yaml").read_bytes() == original
-    export(ExportConfig(tmp_path / "a", output=tmp_path / "a.jsonl"))
+    assert (run_dir / "calibration.yaml").read_bytes() == original
+    export(ExportConfig(run_dir, output=tmp_path / "a.jsonl"))
     lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
     assert [line["frame"] for line in lines] == list(range(FRAMES))
     assert {line["status"] for line in lines} == {"tracking"}

@@ -16,6 +16,7 @@ from services.client import Client, Refused, Unavailable
 from services.console import picture
 from services.console.recording import Recording
 from services.messages import Health
+from services.output import command
 from suturetrack.camera import StereoRig
 from suturetrack.grasping import GraspPoint
 from suturetrack.initialization import InitializationConfig
@@ -98,7 +99,7 @@ class Feed:
         """Starts or completes a recording; raises InputError."""
         if on:
             return {"text": f"Recording to {self.recording.start()}."}
-        return {"text": f"Recorded. Open it with: suturetrack view {self.recording.stop()}"}
+        return {"text": f"Recorded. Open it with: {command('view', self.recording.stop())}"}
 
     def _sight(self) -> tuple[StereoRig, RidgeField]:
         with self._field_lock:
