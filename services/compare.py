@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -69,7 +69,7 @@ def run(config: CompareConfig) -> None:
     if len(config.run_dirs) < 2:
         raise InputError("give two or more run folders")
     folders = [RunFolder(path) for path in config.run_dirs]
-    summaries = [summarize(folder) for folder in folders]
+    summaries = _told_apart([summarize(folder) for folder in folders], config.run_dirs)
     first = summaries[0]
     distances = [d for other in summaries[1:] for d in compare(first, other, folders[0].rig())]
     show(summaries, distances, report_console())
@@ -78,6 +78,13 @@ def run(config: CompareConfig) -> None:
     excess = exceeded(summaries, distances, config)
     if excess:
         sys.exit(f"suturetrack compare: {'; '.join(excess)}")
+
+
+def _told_apart(summaries: list[RunSummary], paths: Sequence[Path]) -> list[RunSummary]:
+    """The summaries, under the paths of the folders where several have one name."""
+    if len({summary.name for summary in summaries}) == len(summaries):
+        return summaries
+    return [replace(s, name=str(path)) for s, path in zip(summaries, paths, strict=True)]
 
 
 def compare(first: RunSummary, other: RunSummary, rig: StereoRig) -> list[Distances]:
@@ -97,7 +104,7 @@ def show(summaries: list[RunSummary], distances: list[Distances], console: Conso
     label_of = dict(zip(names, labels, strict=True))
     legend = new_table("Runs", "", "folder")
     for label, name in zip(labels, names, strict=True):
-        legend.add_row(label, name)
+        legend.add_row(label, escape(name))
     console.print(legend)
     for label, summary in zip(labels, summaries, strict=True):
         for problem in summary.problems:

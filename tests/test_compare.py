@@ -82,6 +82,21 @@ def test_a_thread_that_a_run_lacks_fails_the_check(
         run(CompareConfig((tmp_path / "empty", runs[0]), tolerance_tracking=5.0))
 
 
+def test_runs_of_one_name_in_different_folders_are_told_apart(
+    tmp_path: Path, rig: StereoRig, curve: Nurbs, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = tuple(tmp_path / name / "[/run]" for name in ("first", "empty", "equal"))
+    for folder in (folders[0], folders[2]):
+        record(folder, rig, curve, 0.0)
+    with Recorder(folders[1], "tracker", "light", rig) as recorder:
+        recorder.states([], published_ns=10**18)
+    with pytest.raises(SystemExit, match=r"empty/\[/run\]: thread 0 has no curve") as caught:
+        run(CompareConfig(folders, tolerance_mm=1.0))
+    assert "equal/" not in str(caught.value)
+    shown = capsys.readouterr().out
+    assert all(f" {folder} " in shown for folder in folders)
+
+
 def test_a_recording_that_is_cut_is_not_taken_for_a_run_without_a_thread(
     runs: tuple[Path, Path, Path], rig: StereoRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
