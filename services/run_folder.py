@@ -43,6 +43,8 @@ from suturetrack.types import (
 T = TypeVar("T")
 Row = dict[str, Any]
 """Columns of one row, with `entity`; lists are NumPy arrays, what was not logged is missing."""
+_ROW_ID = "rerun.controls.RowId"
+"""Unlike that of any other row of any recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +92,17 @@ class RunFolder:
         return list(self._readers)
 
     def rows(self, *contents: str) -> Iterator[Row]:
-        """Every row of the entities that match (`/plots/**`), in no order across entities."""
+        """Every row of the entities that match (`/plots/**`), in no order across entities.
+
+        Once, too, where somebody has copied or merged files within the folder.
+        """
+        given: set[bytes] = set()
         for reader in self._readers.values():
             for chunk in reader.stream().filter(content=list(contents)):
-                yield from _rows(str(chunk.entity_path), chunk.to_record_batch())
+                for row in _rows(str(chunk.entity_path), chunk.to_record_batch()):
+                    if row[_ROW_ID] not in given:
+                        given.add(row[_ROW_ID])
+                        yield row
 
     def states(self) -> list[RecordedState]:
         """All states of all threads, by frame and thread."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import rerun as rr
 
 from services.export import ExportConfig, run
 from services.recording import Recorder
+from services.run_folder import rerun_program
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.types import Energies, InputError, Nurbs, Stamp, Status, ThreadState
@@ -85,6 +88,16 @@ def test_threads_and_parts_are_merged_in_order(
     assert [(x["frame"], x["thread"]) for x in lines] == [
         (i, name) for i in range(20) for name in ("a/0", "b")
     ]
+
+
+def test_a_copy_and_a_merged_file_in_the_folder_add_nothing(
+    tmp_path: Path, rig: StereoRig, curve: Nurbs
+) -> None:
+    record(tmp_path, rig, [make_state(curve, i) for i in range(20)])
+    shutil.copy(tmp_path / "tracker.rrd", tmp_path / "tracker (copy).rrd")
+    merge = [rerun_program(), "rrd", "merge", tmp_path / "tracker.rrd", "-o", tmp_path / "all.rrd"]
+    subprocess.run(merge, check=True, capture_output=True)
+    assert [line["frame"] for line in exported(tmp_path)] == list(range(20))
 
 
 def test_a_name_with_an_unknown_ending_is_refused_and_not_written(
