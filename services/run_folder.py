@@ -64,7 +64,7 @@ class RunFolder:
     """All recordings of one run.
 
     Files that a killed process left behind are read as far as they go; files that cannot be read,
-    or only in part, are named in `problems`.
+    or only in part, are named in `problems`; so is a tracker's that is missing.
     """
 
     def __init__(self, run_dir: Path | str) -> None:
@@ -85,6 +85,10 @@ class RunFolder:
         if not self._readers:
             raise InputError(f"{self.path}: no recording can be read: {'; '.join(self.problems)}")
         self._check_version()
+        if not any(_part(file)[0] == "tracker" for file in files) and "tracker" not in self.about():
+            self.problems.append(
+                "no recording of the tracker is here: no states, nor what was asked"
+            )
 
     @property
     def files(self) -> list[Path]:

@@ -130,13 +130,19 @@ def test_folders_without_a_recording_are_named(tmp_path: Path, whole: Path) -> N
 
 
 @pytest.mark.parametrize("kept", NAMES)
-def test_one_process_alone_is_read(tmp_path: Path, whole: Path, kept: str) -> None:
+def test_one_process_alone_is_read(
+    tmp_path: Path, whole: Path, kept: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     alone = tmp_path / "alone"
     alone.mkdir()
     shutil.copy(whole / kept, alone)
     said = outcomes(whole, alone, tmp_path / "new")
     assert [said[name] for name in ("inspect", "compare", "view")] == ["", "", ""]
     assert ("no states" in said["export"]) == (kept != "tracker.rrd")
+    shown = capsys.readouterr()
+    for words in (shown.out, shown.err):
+        assert ("no recording of the tracker is here" in words) == (kept != "tracker.rrd")
+    assert "no thread was seeded" not in shown.out
 
 
 def test_a_foreign_recording_is_left_alone(
