@@ -90,6 +90,7 @@ def run(config: ReplayConfig) -> None:
         raise InputError(f"{config.run}: no recording tells at which level it was made")
     if config.from_ == "tracker" and level != "full":
         raise InputError(f"{config.run}: recorded {level}; --from tracker needs full")
+    _check_material(folder, config)
     if level != "full":
         print(
             f"{config.run} was recorded {level}: its frames are JPEG, results may differ a little"
@@ -104,6 +105,17 @@ def run(config: ReplayConfig) -> None:
     service = ServiceConfig(run_dir=new, recording=config.recording, lockstep=True)
     _replay(folder, parameters, service, config.from_)
     print(f"Replayed to {new}; compare: {command('compare', config.run, new)}")
+
+
+def _check_material(folder: RunFolder, config: ReplayConfig) -> None:
+    from_segmenter = config.from_ == "segmenter"
+    material = folder.frames() if from_segmenter else folder.fields()
+    if next(iter(material), None) is None:
+        what, whose = ("frames", "source") if from_segmenter else ("fields", "segmenter")
+        raise InputError(
+            f"{config.run}: no {what} that could be replayed; the recording of the {whose} is "
+            "missing or empty"
+        )
 
 
 def changed(parameters: Parameters, changes: Iterable[str]) -> Parameters:

@@ -223,6 +223,19 @@ def test_what_cannot_be_replayed_is_said(tmp_path: Path, recorded: Path) -> None
         run(ReplayConfig(recorded, recorded / "config.toml" / "new"))
 
 
+@pytest.mark.parametrize(
+    ("first", "lost", "words"),
+    [("segmenter", "source", "no frames .* source"), ("tracker", "segmenter", "no fields .* segm")],
+)
+def test_a_run_without_what_is_played_is_not_replayed(
+    tmp_path: Path, recorded: Path, first: Literal["segmenter", "tracker"], lost: str, words: str
+) -> None:
+    shutil.copytree(recorded, tmp_path / "run", ignore=shutil.ignore_patterns(f"{lost}*.rrd"))
+    with pytest.raises(InputError, match=f"run: {words}"):
+        run(ReplayConfig(tmp_path / "run", tmp_path / "new", first))
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_seed_that_is_not_found_by_the_end_fails_a_replay_too(
     tmp_path: Path, recorded: Path
 ) -> None:
