@@ -45,6 +45,8 @@ def check(message: object) -> None:
 
 def check_name(name: str, what: str) -> None:
     """Raises ValueError for a name that cannot be part of a key."""
+    if not isinstance(name, str):
+        raise ValueError(f"{what} {name!r}: a name is a string")
     if not NAME.fullmatch(name):
         raise ValueError(f"{what} {name[:80]!r}: use 1 to 64 of A-Z a-z 0-9 _ -")
 

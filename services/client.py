@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 
@@ -210,6 +210,10 @@ class Client:
         """
         if sum((pixel is not None, point is not None, area is not None, laser)) != 1:
             raise InputError("give exactly one of a pixel, a point, an area and the laser")
+        if view not in ("left", "right"):
+            raise InputError(f"view {view!r}: use left or right")
+        pixel, point = _plain(pixel, (2,), "pixel"), _plain(point, (3,), "point")
+        area = _plain(area, (4,), "area")
         if area is not None:
             rig, field = self.calibration(), self._newest(topics.FIELD)
             pixel = pixel_in_area(field, rig, area, right=view == "right")
@@ -253,8 +257,16 @@ class Client:
             Unavailable: nobody answers.
             InputError: not exactly one place, or no direction.
         """
-        where = GraspPoint(from_start, from_end, fraction, near)
-        reply = self._ask(topics.GRASP, GraspRequest(thread, where, approach), _ANSWER_S)
+        where = GraspPoint(
+            _plain(from_start, (), "from_start"),
+            _plain(from_end, (), "from_end"),
+            _plain(fraction, (), "fraction"),
+            _plain(near, (3,), "near"),
+        )
+        request = GraspRequest(
+            thread, where, _plain(approach, (3,), "approach") or AWAY_FROM_CAMERA
+        )
+        reply = self._ask(topics.GRASP, request, _ANSWER_S)
         if reply.grasp is None:
             raise Refused(reply.reason)
         return reply.grasp
@@ -269,8 +281,19 @@ class Client:
             rotation: (3, 3) columns x, y, z of the tool's frame in the base frame.
             trigger: whether it is held.
             tool: name.
+
+        Raises:
+            InputError: a bad name, or no pose.
         """
-        pose = ToolPose(tool, time.time_ns(), position, rotation, trigger)
+        at, turned = (
+            np.array(_plain(values, shape, what))
+            for values, shape, what in (
+                (position, (3,), "position"),
+                (rotation, (3, 3), "rotation"),
+            )
+        )
+        pose = ToolPose(tool, time.time_ns(), at, turned, bool(trigger))
+        _check(pose)
         self.bus.publish(topics.TOOL, pose)
 
     def calibration(self) -> StereoRig:
@@ -313,10 +336,7 @@ class Client:
         return message
 
     def _ask(self, question: Question[Q, A], content: Q, timeout: float) -> A:
-        try:
-            check(content)
-        except ValueError as error:
-            raise InputError(str(error)) from error
+        _check(content)
         # The processes of a rig appear a moment after the connection was opened.
         if not self.bus.wait_for_alive(question.server, _ARRIVAL_S):
             raise self._unavailable(f"the {question.server} does not answer")
@@ -355,3 +375,25 @@ class Client:
                 for inbox, thread in self._listeners.items():
                     if thread in (None, state.thread):
                         inbox.put(seen)
+
+
+def _plain(values: Any, shape: tuple[int, ...], what: str) -> Any:
+    """Numbers of a shape, NumPy's too, as Python's own; None stays None. Raises InputError."""
+    if values is None:
+        return None
+    try:
+        array = np.array(values, float)
+    except (TypeError, ValueError):
+        array = np.full(1, np.nan)
+    if array.shape != shape or not np.isfinite(array).all():
+        wanted = f"{'x'.join(map(str, shape))} finite numbers" if shape else "a finite number"
+        raise InputError(f"{what} {values!r}: use {wanted}")
+    plain = array.tolist()
+    return tuple(plain) if shape else plain
+
+
+def _check(message: object) -> None:
+    try:
+        check(message)
+    except ValueError as error:
+        raise InputError(str(error)) from error

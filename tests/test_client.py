@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -283,6 +283,46 @@ def test_grasps_are_answered_or_refused(stage: Stage) -> None:
         stage.client.grasp(fraction=0.5)
     with pytest.raises(InputError, match="exactly one"):
         stage.client.grasp(fraction=0.5, from_end=0.1)
+
+
+def test_numbers_may_be_numpys(stage: Stage) -> None:
+    asked: list[Any] = []
+    pose = Grasp(Stamp(0, 0, 0), "0", np.ones(3), np.eye(3), 1e-4)
+    stage.tracker.answer(topics.GRASP, lambda r: asked.append(r) or GraspReply("0", pose))
+    stage.tracker.answer(topics.SEED, lambda s: asked.append(s) or SeedReply(s.thread, True, ""))
+    stage.tracker.declare_alive()
+    stage.client.grasp(from_end=np.float64(0.01), approach=np.array([0, 0, 1]))
+    stage.client.grasp(fraction=np.float32(0.5))
+    stage.client.seed(np.array([3, 4]))
+    stage.client.seed(point=np.array([0.1, 0.2, 0.3]))
+    assert [r.where.from_end for r in asked[:1]] + [asked[1].where.fraction] == [0.01, 0.5]
+    assert [s.pixel or s.point for s in asked[2:]] == [(3.0, 4.0), (0.1, 0.2, 0.3)]
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda c: c.grasp(from_end="10mm"), "from_end '10mm': use a finite number"),
+        (lambda c: c.grasp(near=(0.1, 0.2)), r"near \(0.1, 0.2\): use 3 finite"),
+        (lambda c: c.grasp(fraction=0.5, approach="down"), "approach 'down': use 3 finite"),
+        (lambda c: c.grasp(0, fraction=0.5), "thread 0: a name is a string"),
+        (lambda c: c.forget(None), "thread None: a name is a string"),
+        (lambda c: c.seed((3.0,)), "pixel .*: use 2 finite"),
+        (lambda c: c.seed((np.nan, 3.0), view="right"), "pixel .*: use 2 finite"),
+        (lambda c: c.seed((3.0, 4.0), view="rigth"), "view 'rigth': use left or right"),
+        (lambda c: c.seed(area=(1, 2, 3)), "area .*: use 4 finite"),
+        (lambda c: c.move_tool(np.zeros(2), np.eye(3), trigger=False), "position .*: use 3 finite"),
+        (lambda c: c.move_tool(np.zeros(3), 2 * np.eye(3), trigger=False), "rotation is no rota"),
+        (lambda c: c.move_tool(np.zeros(3), np.eye(3), trigger=False, tool="a/b"), "tool 'a/b'"),
+    ],
+)
+def test_wrong_arguments_are_told_before_anyone_is_asked(
+    stage: Stage, ask: Callable[[Client], object], words: str
+) -> None:
+    stage.tracker.declare_alive()
+    with pytest.raises(InputError, match=words) as caught:
+        ask(stage.client)
+    assert type(caught.value) is InputError
 
 
 def test_a_forgotten_thread_is_gone_after_its_last_state(stage: Stage) -> None:
