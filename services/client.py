@@ -58,7 +58,7 @@ log = logging.getLogger("suturetrack")
 
 
 class Unavailable(InputError):
-    """Nobody is there to answer; the text says what to start."""
+    """Nobody is there to answer, and the text says what to start; or the client is closed."""
 
 
 class Refused(InputError):
@@ -284,6 +284,7 @@ class Client:
 
         Raises:
             InputError: a bad name, or no pose.
+            Unavailable: the client is closed.
         """
         at, turned = (
             np.array(_plain(values, shape, what))
@@ -294,6 +295,7 @@ class Client:
         )
         pose = ToolPose(tool, time.time_ns(), at, turned, bool(trigger))
         _check(pose)
+        self._require_open()
         self.bus.publish(topics.TOOL, pose)
 
     def calibration(self) -> StereoRig:
@@ -328,6 +330,7 @@ class Client:
 
         Images and fields are read no longer than that: a controller's link has room for little else.
         """
+        self._require_open()
         self.bus.alive()  # begins to look who is there
         with self.bus.newest(topic) as reader:
             message = reader.get(_ARRIVAL_S)
@@ -337,6 +340,7 @@ class Client:
 
     def _ask(self, question: Question[Q, A], content: Q, timeout: float) -> A:
         _check(content)
+        self._require_open()
         # The processes of a rig appear a moment after the connection was opened.
         if not self.bus.wait_for_alive(question.server, _ARRIVAL_S):
             raise self._unavailable(f"the {question.server} does not answer")
@@ -345,8 +349,13 @@ class Client:
         except NoAnswer as error:
             raise self._unavailable(f"the {question.server} does not answer: {error}") from error
 
+    def _require_open(self) -> None:
+        if self.bus.stop.is_set:
+            raise Unavailable("this client is closed; connect again")
+
     def _unavailable(self, what: str) -> Unavailable:
         """The error, with the processes that are missing and how to start them."""
+        self._require_open()  # who closes it meanwhile ends all waiting
         alive, rig = self.bus.alive(), self.bus.rig
         absent = [name for name in topics.PROCESSES if name not in alive]
         if not absent:

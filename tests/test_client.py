@@ -370,6 +370,43 @@ def test_threads_of_a_slow_stream_are_not_gone_between_two_frames(
     wait_until(lambda: stage.client.threads == ("a",))
 
 
+def test_a_closed_client_says_so(stage: Stage) -> None:
+    """Also to who waited for an answer when another thread closed it."""
+    asked, closed = threading.Event(), threading.Event()
+
+    def answer_late(seed: Seed) -> SeedReply:
+        asked.set()
+        closed.wait(30)
+        return SeedReply(seed.thread, True, "")
+
+    stage.tracker.answer(topics.SEED, answer_late)
+    stage.tracker.declare_alive()
+    errors: list[BaseException] = []
+
+    def ask() -> None:
+        try:
+            stage.client.seed((1.0, 2.0), timeout=0.2)
+        except InputError as error:
+            errors.append(error)
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    assert asked.wait(10)
+    stage.client.close()
+    asking.join(10)
+    closed.set()
+    for call in (
+        lambda c: c.grasp(fraction=0.5),
+        lambda c: c.seed(laser=True),
+        lambda c: c.calibration(),
+        lambda c: c.move_tool(np.zeros(3), np.eye(3), trigger=False),
+    ):
+        with pytest.raises(Unavailable) as caught:
+            call(stage.client)
+        errors.append(caught.value)
+    assert [str(error) for error in errors] == 5 * ["this client is closed; connect again"]
+
+
 def test_nobody_there_is_said_plainly(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.client._ARRIVAL_S", 0.05)
     nobody = (
