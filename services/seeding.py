@@ -98,7 +98,9 @@ class SeedDesk:
         last = {state.thread: state for state in (*heard, *held)}
         # A seed may have gone with the source that kept it.
         lying = [seed_on(state) for state in last.values() if state.curve is not None]
-        for seed in {seed.thread: seed for seed in (*lying, *given, *asked)}.values():
+        # So may the word that a thread was dropped; every other thread has a state in each frame.
+        wanted = [seed for seed in given if not last or seed.thread in last]
+        for seed in {seed.thread: seed for seed in (*lying, *wanted, *asked)}.values():
             state = last.get(seed.thread)
             if state is not None and FORGOTTEN in state.events:
                 continue

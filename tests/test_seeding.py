@@ -42,6 +42,25 @@ def test_a_seed_is_taken_up_when_it_came_after_its_thread_was_dropped(
     source.close()
 
 
+@pytest.mark.parametrize("others", [False, True])
+def test_a_given_seed_of_which_nothing_is_heard_beside_others_was_dropped(
+    rig: StereoRig, others: bool
+) -> None:
+    """The source that kept its last word has died, and the tracker after it."""
+    hub = Hub()
+    source, before, after = (Bus(hub.connect(), "rig", n) for n in ("source", *2 * ("tracker",)))
+    source.keep(topics.STATE, _is_worth_more)
+    if others:
+        state = not_found("b", Stamp(7, 7, 7), ())
+        before.publish(topics.STATE, scaled(state, rig.metres_per_unit))
+    before.close()
+    tracker = Tracker(rig)
+    SeedDesk(after, tracker, rig).resume([Seed("a", pixel=(320.0, 240.0))])
+    assert tracker.is_sought("a") != others
+    after.close()
+    source.close()
+
+
 @pytest.mark.parametrize(("depth", "said"), [(148_000.0, "148"), (0.148, "0.000148")])
 def test_a_point_in_another_unit_than_metres_is_refused(
     rig: StereoRig, depth: float, said: str
