@@ -92,7 +92,7 @@ class Follower:
         """When it was certain last where the thread runs, and for a moment before."""
         self._doubted_ns = self._regrown_ns = self._led_back_ns = -(1 << 62)
         self._drift = Drift()
-        self._bends = Bends()
+        self._bends = Bends(self.rig)
         self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
         self._share_seen = 1.0
@@ -177,7 +177,7 @@ class Follower:
         model, drift = self.model, self._drift
         self._hidden.step(evidence.evenly_hidden & ~drift.outside, model.capture_ns)
         wrong, uncertain_s = self._wrong(evidence, astray, plain, seconds)
-        is_kinked = self._bends.step(model.curve, evidence.evenly_seen, seconds)
+        is_kinked = self._bends.step(model.curve, evidence, seconds)
         status = self._status(evidence, plain, uncertain_s, is_kinked)
         self._lost = status is Status.LOST
         if status is Status.TRACKING:
@@ -262,7 +262,7 @@ class Follower:
         last = RELIABILITY_SAMPLES - 1
         self.model.curve = nurbs.part(self.model.curve, start / last, 1 - stop / last)
         self._drift.cut(start, stop)
-        self._bends = Bends()
+        self._bends = Bends(self.rig)
 
     def _start_again(self) -> None:
         """Looks from where the thread was last held, from the next field on."""
