@@ -71,8 +71,6 @@ class Fit:
 
     curve: Nurbs
     samples: Samples
-    offsets: tuple[Offsets, Offsets]
-    """Of the last iteration, before its step."""
     residual: Float64
     """(k, 2) px between the curve and what was found, left and right; nan where nothing was."""
     covariance: Float64
@@ -146,9 +144,7 @@ def fit(
         outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
         reach = max(reach / 2, _REFINED_PX)
     curve = curve_from(spline.DEGREE, predicted.knots, control_points)
-    residual = _residual(pixels, linear)
-    covariance = equations.covariance(samples)
-    return Fit(curve, samples, linear.offsets, residual, covariance, crowd)
+    return Fit(curve, samples, _residual(pixels, linear), equations.covariance(samples), crowd)
 
 
 def observe(
@@ -166,8 +162,7 @@ def observe(
     equations = linear.equations(reference, still, config, _OUTLIER_PX, crowd, surprise)
     equations.solve()
     residual = _residual([view.pixels for view in linear.views], linear)
-    covariance = equations.covariance(samples)
-    return Fit(curve, samples, linear.offsets, residual, covariance, crowd)
+    return Fit(curve, samples, residual, equations.covariance(samples), crowd)
 
 
 def _crowd(curve: Nurbs, samples: Samples, images: Images, neighbours: Neighbours) -> Crowd:
