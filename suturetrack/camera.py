@@ -34,6 +34,10 @@ class Camera:
     fisheye: bool = False
     """Whether `distortion` holds the four coefficients of the equidistant model (`cv2.fisheye`)."""
 
+    def with_pixels(self, change: Float64) -> Camera:
+        """The camera whose raw and rectified pixels (u, v, 1) are (3, 3) `change` times those here."""
+        return replace(self, matrix=change @ self.matrix, projection=change @ self.projection)
+
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
@@ -111,11 +115,8 @@ class StereoRig:
         """The same rig for images that are `factor` times as wide and high; frames stay as they are."""
         shift = (factor - 1) / 2  # the centre of the corner pixel moves in the corner pixel
         change = np.array([[factor, 0, shift], [0, factor, shift], [0, 0, 1]])
-        left, right = (
-            replace(c, matrix=change @ c.matrix, projection=change @ c.projection)
-            for c in (self.left, self.right)
-        )
         width, height = (round(side * factor) for side in self.image_size)
+        left, right = self.left.with_pixels(change), self.right.with_pixels(change)
         return replace(self, image_size=(width, height), left=left, right=right)
 
     @property
@@ -149,13 +150,10 @@ class StereoRig:
     def reduced(self, scale: int) -> StereoRig:
         """The rig for rectified images of which only every `scale`-th pixel is kept, from the first."""
         shrink = np.diag([1 / scale, 1 / scale, 1.0])
-        left, right = (
-            replace(c, matrix=shrink @ c.matrix, projection=shrink @ c.projection)
-            for c in (self.left, self.right)
-        )
+        left, right = self.left.with_pixels(shrink), self.right.with_pixels(shrink)
         width, height = self.image_size
         size = -(-width // scale), -(-height // scale)
-        return StereoRig(size, left, right, self.metres_per_unit)
+        return replace(self, image_size=size, left=left, right=right)
 
     def with_row_offset(self, rows: float) -> StereoRig:
         """The rig whose right view shows everything `rows` px lower, against the left one, than here.
@@ -164,13 +162,8 @@ class StereoRig:
         """
         if not rows:
             return self
-        left, right = (
-            replace(c, matrix=lower @ c.matrix, projection=lower @ c.projection)
-            for c, lower in (
-                (self.left, np.array([[1.0, 0, 0], [0, 1, -rows / 2], [0, 0, 1]])),
-                (self.right, np.array([[1.0, 0, 0], [0, 1, rows / 2], [0, 0, 1]])),
-            )
-        )
+        left = self.left.with_pixels(np.array([[1.0, 0, 0], [0, 1, -rows / 2], [0, 0, 1]]))
+        right = self.right.with_pixels(np.array([[1.0, 0, 0], [0, 1, rows / 2], [0, 0, 1]]))
         return replace(self, left=left, right=right)
 
     @cached_property
