@@ -30,7 +30,9 @@ from suturetrack.tracking.mouth import Mouth
 from suturetrack.tracking.regrowth import loose_tails, regrown
 from suturetrack.tracking.reliability import (
     ASTRAY,
+    MOST,
     RELIABILITY_SAMPLES,
+    SOME,
     Evidence,
     judge,
     loose_ends,
@@ -49,7 +51,6 @@ _SURE_AFTER_S = 0.08
 _VAGUE = 0.0225
 # How long a doubtful end is held before it is cut off.
 _PATIENCE_S = 0.06
-_SOME = 0.2
 # How often ends that are not seen are looked for elsewhere, and crowded stretches are led back.
 _REGROWN_S = _LED_BACK_S = 0.09
 # For how long a hidden end is taken to be where it was, and after how long it is gone.
@@ -161,7 +162,7 @@ class Follower:
             evidence = self._grow_ends_anew(images, evidence, neighbours)
             evidence = self._lead_back(images, evidence, neighbours)
         self._seen = evidence.evenly_seen
-        if evidence.share >= 0.5:
+        if evidence.share >= MOST:
             model.seen_ns = model.capture_ns
             self._learn_levels(field)
             images = replace(images, levels=model.levels)
@@ -183,13 +184,13 @@ class Follower:
         if status is Status.TRACKING:
             self.last_good = model.curve
         elif self._lost and (
-            evidence.share < _SOME or self.known_length.is_beyond_hope(length_of(model.curve))
+            evidence.share < SOME or self.known_length.is_beyond_hope(length_of(model.curve))
         ):
             self._start_again()
         elif self.config.method != "paper":
             if uncertain_s > _PATIENCE_S:
                 self._trim(wrong | drift.hopeless)
-            elif not self._lost and evidence.share >= _SOME:
+            elif not self._lost and evidence.share >= SOME:
                 self._give_up_hidden_ends()
         return status
 
@@ -251,7 +252,7 @@ class Follower:
     def _give_up_hidden_ends(self) -> None:
         """What has been hidden at an end for long is no part of the thread until it is seen again."""
         start, stop = self._hidden.for_longer_than(_GONE_S)
-        if 0 < start + stop < (1 - _SOME) * RELIABILITY_SAMPLES:
+        if 0 < start + stop < (1 - SOME) * RELIABILITY_SAMPLES:
             self._cut_off(start, stop)
             self._hidden = HiddenEnds(self.model.capture_ns)
             known = self.known_length = self.known_length.given_up(length_of(self.model.curve))

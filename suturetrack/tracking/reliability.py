@@ -21,10 +21,8 @@ _NEAR_PX = 1.5
 _BESIDE_PX, _NOT_OWN_PX = np.arange(-30.0, 30.1, 1.5), 6.0
 _NEXT_PX, _NOT_TAKEN_PX = np.arange(-10.0, 10.1, 1.0), 3.0
 _CLEAR = 0.5
-# Shares of the curve's length.
-_MOST = 0.5
-_SOME = 0.2
-ASTRAY = 0.05
+# Shares of the curve's length: what has to be seen to be tracked, and to be held; what may be astray.
+MOST, SOME, ASTRAY = 0.5, 0.2, 0.05
 _LOST_AFTER_S = 0.2
 _GAP = 5
 # Share that has to run alone, so that the others, which other ridges draw aside, hardly make it longer.
@@ -167,8 +165,8 @@ def judge(evidence: Evidence, unseen_s: float, uncertain_s: float) -> Status:
     """
     if uncertain_s > _LOST_AFTER_S:
         return Status.LOST
-    if evidence.share >= _MOST and uncertain_s == 0:
+    if evidence.share >= MOST and uncertain_s == 0:
         return Status.TRACKING
-    if evidence.share >= _SOME or unseen_s < _LOST_AFTER_S:
+    if evidence.share >= SOME or unseen_s < _LOST_AFTER_S:
         return Status.OCCLUDED
     return Status.LOST
