@@ -13,7 +13,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationConfig, InitializationError, initialize
 from suturetrack.initialization.result import nearest_ridges
 from suturetrack.initialization.segments import find_ridges, nearest_segment
-from suturetrack.metrics import nearest_index
+from suturetrack.polylines import nearest_index
 from suturetrack.types import Float32, Float64, Image, InputError, Nurbs, RidgeField, Seed
 
 _SAMPLES = 400

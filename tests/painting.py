@@ -9,7 +9,7 @@ from scipy.special import erfc
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.metrics import arc_lengths, polyline_length
+from suturetrack.polylines import arc_lengths, polyline_length
 from suturetrack.types import Nurbs, RidgeField, Stamp
 
 WIDTH_PX = 1.5

@@ -22,6 +22,7 @@ from services.bench.tracking import Case, FrameScore, TrackingBench, score, summ
 from services.bench.tracking import rows as tracking_rows
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
+from suturetrack.polylines import polyline_distances
 from suturetrack.stage import Picture
 from suturetrack.types import Energies, InputError, Nurbs, Stamp, Status, ThreadState, Truth
 from tests.conftest import make_rig, wait_until
@@ -146,7 +147,7 @@ def test_the_physical_limit_is_reached_by_the_best_estimate(rig: StereoRig) -> N
         noisy = [p + rng.normal(0, 1, (400, 1)) * along_u for p in (left, right)]
         fitted = nurbs.fit(rig.triangulate(*noisy), np.linspace(0, 1, 400), knots, 3)
         curve = nurbs.evaluate(fitted, np.linspace(0, 1, 400))
-        errors.append(metrics.polyline_distances(curve, points))
+        errors.append(polyline_distances(curve, points))
     achieved = float(np.sqrt(np.mean(np.square(errors))))
     assert 0.5 * achieved < metrics.physical_limit(rig, points, 0.05) < 1.1 * achieved
 

@@ -9,6 +9,7 @@ import pytest
 
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
+from suturetrack.polylines import polyline_offsets
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
@@ -167,7 +168,7 @@ def test_strands_that_make_one_ridge_do_not_bend_an_arm_that_shows_no_depth() ->
         truth = scene.truth(i)[0]
         assert state.curve is not None
         curve = nurbs.evaluate(state.curve, np.linspace(0, 1, 200))
-        apart.append(mm * np.linalg.norm(metrics.polyline_offsets(curve, truth.points), axis=1))
+        apart.append(mm * np.linalg.norm(polyline_offsets(curve, truth.points), axis=1))
         lengths.append(state.length / truth.length)
     assert np.percentile(apart, 95) < 1.5
     np.testing.assert_allclose(lengths, 1.0, atol=0.025)

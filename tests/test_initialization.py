@@ -19,7 +19,8 @@ from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.ends import read_end
 from suturetrack.initialization.segments import find_ridges, split_at_touches
 from suturetrack.initialization.topology import merge_ends
-from suturetrack.metrics import curve_error, polyline_distances, polyline_length
+from suturetrack.metrics import curve_error
+from suturetrack.polylines import polyline_distances, polyline_length
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import Picture, Scene, open_scene
 from suturetrack.types import (

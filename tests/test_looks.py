@@ -19,6 +19,7 @@ from suturetrack.initialization import (
     initialize,
 )
 from suturetrack.initialization.matching import raised
+from suturetrack.polylines import polyline_length
 from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.images import Images
@@ -415,7 +416,7 @@ def test_what_was_never_sure_does_not_tell_the_length_but_is_no_stub(
 
     looks_by(monkeypatch, look)
     states = follow(rig, truths, away)
-    assert states[0].length == pytest.approx(first * metrics.polyline_length(whole[0]), rel=0.1)
+    assert states[0].length == pytest.approx(first * polyline_length(whole[0]), rel=0.1)
     assert states[away[-1]].status is Status.LOST
     if later == 1.0:
         assert states[-1].status is Status.TRACKING
@@ -627,7 +628,7 @@ def test_a_revoked_curve_does_not_tell_the_length(
     tracker.seed(seed_on(rig, pair(0)[0]))
     fields = fields_of(rig, 3 * FPS, range(0))
     states = [tracker.step(field).states[0] for field in fields]
-    lengths = [metrics.polyline_length(points) for points in pair(0)]
+    lengths = [polyline_length(points) for points in pair(0)]
     assert abs(lengths[0] - lengths[1]) > 0.1 * lengths[0]
     assert states[revoked_at - 1].status is Status.TRACKING
     assert rms(states[revoked_at - 1], pair(revoked_at - 1)[0]) < 0.2
@@ -745,7 +746,7 @@ def test_what_was_taken_for_the_thread_since_does_not_tell_its_length_alone(
         tracker.step(paint(rig, [truth, other], i)).states[0] for i, other in enumerate(grown)
     ]
     assert states[plain_at].status is Status.OCCLUDED
-    assert states[plain_at].length == pytest.approx(metrics.polyline_length(grown[-1]), rel=0.01)
+    assert states[plain_at].length == pytest.approx(polyline_length(grown[-1]), rel=0.01)
     assert rms(states[-1], truth) < 0.1
 
 

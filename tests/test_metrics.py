@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from suturetrack import metrics
+from suturetrack.polylines import coverage, polyline_distances, polyline_length
 
 LINE = np.c_[np.linspace(0, 100, 501), np.zeros(501), np.full(501, 200.0)]
 
@@ -24,16 +25,16 @@ def test_a_shifted_curve_is_its_shift_away() -> None:
 
 
 def test_distances_do_not_depend_on_the_sampling() -> None:
-    assert metrics.polyline_distances(LINE, LINE[::50]).max() == pytest.approx(0, abs=1e-9)
+    assert polyline_distances(LINE, LINE[::50]).max() == pytest.approx(0, abs=1e-9)
 
 
 def test_a_curve_that_misses_a_part_is_close_one_way_only() -> None:
     half = LINE[:251]
-    assert metrics.polyline_distances(half, LINE).max() == pytest.approx(0, abs=1e-9)
+    assert polyline_distances(half, LINE).max() == pytest.approx(0, abs=1e-9)
     error = metrics.curve_error(half, LINE)
     assert error.length_percent == pytest.approx(-50)
     assert error.largest == pytest.approx(50)
-    assert metrics.coverage(half, LINE, 1.0) == pytest.approx(0.51, abs=0.01)
+    assert coverage(half, LINE, 1.0) == pytest.approx(0.51, abs=0.01)
 
 
 def test_order_is_what_nearness_does_not_tell() -> None:
@@ -44,8 +45,8 @@ def test_order_is_what_nearness_does_not_tell() -> None:
     loop = np.stack([20 + 4 * np.sin(turn), 4 - 4 * np.cos(turn), 0 * s], axis=1)
     truth = np.concatenate([straight, loop, straight + np.array([20, 0, 0])])
     backwards = np.concatenate([straight, loop[::-1], straight + np.array([20, 0, 0])])
-    length = metrics.polyline_length(truth)
-    assert metrics.polyline_distances(backwards, truth).max() < 0.01
+    length = polyline_length(truth)
+    assert polyline_distances(backwards, truth).max() < 0.01
     assert metrics.in_order(truth, truth, 0.01 * length) == 1
     assert metrics.in_order(truth[::-1] + np.array([0, 0.3, 0]), truth, 0.01 * length) == 1
     assert 0.5 < metrics.in_order(backwards, truth, 0.01 * length) < 0.75

@@ -7,6 +7,7 @@ import pytest
 
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
+from suturetrack.polylines import polyline_distances
 from suturetrack.tracking import Tracker, TrackingConfig, paper
 from suturetrack.tracking.config import PaperConfig
 from suturetrack.tracking.spacing import evenly, respace
@@ -112,7 +113,7 @@ def test_spacing_evenly_leaves_the_shape_and_the_ends(rig: StereoRig) -> None:
     assert removed > 0
     assert inserted == 0
     at = np.linspace(0, 1, 400)
-    apart = metrics.polyline_distances(nurbs.evaluate(spaced, at), nurbs.evaluate(curve, at))
+    apart = polyline_distances(nurbs.evaluate(spaced, at), nurbs.evaluate(curve, at))
     assert apart.max() < 0.1 * PX_MM
     ends = np.array([0.0, 1.0])
     np.testing.assert_allclose(nurbs.evaluate(spaced, ends), nurbs.evaluate(curve, ends), atol=1e-4)

@@ -13,6 +13,7 @@ import pytest
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, initialize
+from suturetrack.polylines import coverage, polyline_distances, polyline_length, polyline_offsets
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.clearness import Clearness
 from suturetrack.tracking.control_points import rearrange, refit
@@ -89,7 +90,7 @@ def test_a_lost_curve_that_has_grown_far_too_long_goes_back_to_where_it_was(rig:
     assert state.status is Status.LOST
     follower.model.curve = curves[1]
     lengths = [follower.step(paint(rig, [2 * truth], i), "0").length for i in range(25, 28)]
-    assert max(lengths) < 1.1 * metrics.polyline_length(truth)
+    assert max(lengths) < 1.1 * polyline_length(truth)
 
 
 def test_a_thread_that_vanishes_is_lost_in_time_and_found_again(rig: StereoRig) -> None:
@@ -306,7 +307,7 @@ def test_a_known_length_tells_how_far_a_stretch_along_an_epipolar_line_bows(
         return metrics.curve_error(nurbs.evaluate(curve, np.linspace(0, 1, 400)), truth).rms
 
     assert fitted(None) > 0.25
-    assert fitted(metrics.polyline_length(truth)) < 0.1
+    assert fitted(polyline_length(truth)) < 0.1
 
 
 @pytest.mark.parametrize("relief", [2.5, -2.5])
@@ -395,7 +396,7 @@ def test_what_hides_much_of_the_middle_does_not_lose_a_thread_that_is_shaken(
     for state, truth in list(zip(states, truths, strict=True))[10:]:
         assert state.curve is not None
         samples = nurbs.evaluate(state.curve, np.linspace(0, 1, len(state.seen)))
-        off = np.linalg.norm(metrics.polyline_offsets(samples, truth), axis=1)
+        off = np.linalg.norm(polyline_offsets(samples, truth), axis=1)
         seen_rms.append(np.sqrt((off[state.seen] ** 2).mean()))
         assert 0.1 < 1 - state.seen.mean() < 0.25
         assert off.max() < 5.0
@@ -571,9 +572,7 @@ def test_what_was_hidden_for_long_is_taken_up_at_once(rig: StereoRig) -> None:
         for i in range(hidden.stop + round(1.5 * FPS))
     ]
     states = follow(fields, rig, seed_on(rig, whole[:150]))
-    assert states[hidden.stop - 1].length == pytest.approx(
-        metrics.polyline_length(whole[:340]), rel=0.01
-    )
+    assert states[hidden.stop - 1].length == pytest.approx(polyline_length(whole[:340]), rel=0.01)
     assert states[hidden.stop - 1].status is Status.TRACKING
     assert states[-1].status is Status.TRACKING
     assert error(states[-1], whole).rms < 0.1
@@ -615,7 +614,7 @@ def test_what_is_found_for_sure_has_the_length_that_it_has(rig: StereoRig, is_su
     after.remember(before, is_sure=is_sure)
     states = [after.step(paint(rig, [whole[:520], stray], i), "0") for i in range(FPS)]
     assert (states[-1].status is Status.TRACKING) == is_sure
-    assert states[-1].length == pytest.approx(metrics.polyline_length(whole[:520]), rel=0.01)
+    assert states[-1].length == pytest.approx(polyline_length(whole[:520]), rel=0.01)
 
 
 def test_a_thread_that_is_drawn_out_grows(rig: StereoRig) -> None:
@@ -624,7 +623,7 @@ def test_a_thread_that_is_drawn_out_grows(rig: StereoRig) -> None:
     fields = [paint(rig, [whole[:k]], i) for i, k in enumerate(lengths)]
     states = follow(fields, rig, seed_on(rig, whole[:350]))
     for state, k in list(zip(states, lengths, strict=True))[3:]:
-        assert state.length == pytest.approx(metrics.polyline_length(whole[:k]), rel=0.012)
+        assert state.length == pytest.approx(polyline_length(whole[:k]), rel=0.012)
         assert state.status is Status.TRACKING
     assert len(states[-1].curve.control_points) > len(states[0].curve.control_points)  # type: ignore[union-attr]
 
@@ -641,7 +640,7 @@ def test_a_thread_that_is_drawn_out_past_a_stray_ridge_grows(rig: StereoRig, poi
     fields = [paint(rig, threads, i) for i, threads in enumerate(shown)]
     states = follow(fields, rig, seed_on(rig, whole[:350]))
     assert all(state.status is Status.TRACKING for state in states)
-    assert states[-1].length == pytest.approx(metrics.polyline_length(whole[:560]), rel=0.012)
+    assert states[-1].length == pytest.approx(polyline_length(whole[:560]), rel=0.012)
 
 
 def test_an_end_does_not_run_on_along_what_it_meets(rig: StereoRig) -> None:
@@ -667,7 +666,7 @@ def test_an_end_that_leaves_the_image_is_cut_at_the_border(rig: StereoRig) -> No
     found = nurbs.evaluate(curve, np.linspace(0, 1, 300))
     assert rig.project(found)[0][:, 0].max() < 642
     visible = truths[-1][u < 636]
-    assert metrics.coverage(found, visible, 0.5) > 0.98
+    assert coverage(found, visible, 0.5) > 0.98
 
 
 def test_a_thread_that_comes_in_at_the_border_is_as_long_as_it_is_seen(rig: StereoRig) -> None:
@@ -679,7 +678,7 @@ def test_a_thread_that_comes_in_at_the_border_is_as_long_as_it_is_seen(rig: Ster
     assert all(state.status is Status.TRACKING for state in states[65:])
     for state, truth in list(zip(states, truths, strict=True))[65:]:
         u = rig.project(truth)[0][:, 0]
-        assert state.length == pytest.approx(metrics.polyline_length(truth[u < 639.5]), abs=2.0)
+        assert state.length == pytest.approx(polyline_length(truth[u < 639.5]), abs=2.0)
     assert states[-1].length == pytest.approx(100.0, rel=0.01)
 
 
@@ -848,7 +847,7 @@ def test_an_end_beneath_another_thread_is_no_shorter(rig: StereoRig) -> None:
             tracker.seed(seed_on(rig, below, "a"))
             tracker.seed(seed_on(rig, above, "b"))
         lengths.append(tracker.step(field).states[0].length)
-    assert np.abs(np.array(lengths[1:]) / metrics.polyline_length(below) - 1).max() < 0.01
+    assert np.abs(np.array(lengths[1:]) / polyline_length(below) - 1).max() < 0.01
 
 
 def test_a_thread_that_is_seeded_again_keeps_its_direction(rig: StereoRig) -> None:
@@ -968,7 +967,7 @@ def test_knots_go_where_the_bends_are_and_the_shape_stays(rig: StereoRig) -> Non
         placed, inserted, removed = rearrange(placed, rig)
         if not inserted and not removed:
             break
-    apart = metrics.polyline_distances(nurbs.evaluate(placed, s), points)
+    apart = polyline_distances(nurbs.evaluate(placed, s), points)
     assert apart.max() * 4 < 0.5
     knots = np.unique(placed.knots)
     assert np.diff(knots).min() < 0.5 * np.diff(knots).max()

@@ -19,6 +19,7 @@ from suturetrack import metrics, nurbs
 from suturetrack.calibration import load_calibration
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationError, initialize
+from suturetrack.polylines import polyline_length
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import SCENARIOS, Picture, open_scene
 from suturetrack.types import Float64, InputError, Nurbs, Seed, Stamp, StereoFrame
@@ -185,7 +186,7 @@ def _errors(curve: Nurbs, truth: Float64 | None, unit: float) -> dict[str, float
         return dict.fromkeys(_ERRORS, float("nan"))
     found = _dense(curve)
     error = metrics.curve_error(found, truth)
-    radius = _ORDER_RADIUS * metrics.polyline_length(truth)
+    radius = _ORDER_RADIUS * polyline_length(truth)
     return {
         "mean": unit * error.mean,
         "largest": unit * error.largest,
@@ -200,7 +201,7 @@ def _is_solved(errors: dict[str, float], truth: Float64 | None, unit: float) -> 
     """Mean error below 1 % of the true length and length error below 5 %."""
     if truth is None:
         return bool(np.isfinite(errors["pixels"]))
-    near = errors["mean"] < 0.01 * unit * metrics.polyline_length(truth)
+    near = errors["mean"] < 0.01 * unit * polyline_length(truth)
     return bool(near and abs(errors["length"]) < 5)
 
 

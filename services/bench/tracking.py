@@ -21,6 +21,7 @@ from services.adaptation import follow
 from services.bench import report
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
+from suturetrack.polylines import polyline_offsets
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import SCENARIOS, Picture, open_scene
 from suturetrack.tracking import Tracker, TrackingConfig
@@ -272,8 +273,8 @@ def score(
     visible = truth.points[truth.visible]
     curve = nurbs.evaluate(state.curve, nurbs.evenly_spaced(state.curve, _SAMPLES))
     points = np.concatenate([curve, visible])
-    back = metrics.polyline_offsets(visible, curve) if len(visible) else visible
-    offsets = mm * np.concatenate([metrics.polyline_offsets(curve, truth.points), back])
+    back = polyline_offsets(visible, curve) if len(visible) else visible
+    offsets = mm * np.concatenate([polyline_offsets(curve, truth.points), back])
     distance = np.linalg.norm(offsets, axis=1)
     along = (offsets * points).sum(1) / np.linalg.norm(points, axis=1)
     covered = distance[len(curve) :] <= 1.0

@@ -29,8 +29,8 @@ from suturetrack.initialization.result import (
 )
 from suturetrack.initialization.segments import Ridges, find_ridges, nearest_segment, thread_scale
 from suturetrack.initialization.threads import Thread, follow_thread
-from suturetrack.metrics import nearest_index
 from suturetrack.nurbs import curve_from
+from suturetrack.polylines import nearest_index
 from suturetrack.types import Float32, Float64, Nurbs, RidgeField, Seed
 
 __all__ = [

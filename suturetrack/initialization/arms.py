@@ -11,7 +11,7 @@ from scipy.linalg import cho_solve, cholesky
 from suturetrack.initialization.depth import Depth, Disparities
 from suturetrack.initialization.joints import Pair, inward
 from suturetrack.initialization.pricing import Merge
-from suturetrack.metrics import arc_lengths
+from suturetrack.polylines import arc_lengths
 from suturetrack.types import Float64
 
 REACH = 60

@@ -21,7 +21,7 @@ from suturetrack.initialization.result import PlacedDoubts, in_words, remaining
 from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.threads import Chain
-from suturetrack.metrics import (
+from suturetrack.polylines import (
     arc_lengths,
     coverage,
     nearest_index,

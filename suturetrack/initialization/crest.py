@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack.kernels import search
 from suturetrack.kernels.widths import moments, single
-from suturetrack.metrics import polyline_tangents
+from suturetrack.polylines import polyline_tangents
 from suturetrack.types import Float32, Float64
 
 _OFFSETS = np.arange(-4.0, 4.01, 0.5)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.kernels import search, widths
-from suturetrack.metrics import arc_lengths, polyline_at, polyline_tangents
+from suturetrack.polylines import arc_lengths, polyline_at, polyline_tangents
 from suturetrack.types import Float32, Float64
 
 _INSIDE_PX = 14.0

@@ -11,7 +11,7 @@ from suturetrack.initialization.result import ViewGrowth
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.threads import Thread
 from suturetrack.kernels import growth as kernel
-from suturetrack.metrics import nearest_index
+from suturetrack.polylines import nearest_index
 from suturetrack.types import Float32, Float64
 
 

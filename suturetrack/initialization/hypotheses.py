@@ -17,7 +17,7 @@ from suturetrack.initialization.threads import (
     follow_thread,
     without_faint_tails,
 )
-from suturetrack.metrics import coverage, nearest_index, polyline_distances
+from suturetrack.polylines import coverage, nearest_index, polyline_distances
 from suturetrack.types import Float64, RidgeField
 
 _UNMATCHED = 0.35

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.kernels import crest, search
-from suturetrack.metrics import nearest_index, polyline_tangents
+from suturetrack.polylines import nearest_index, polyline_tangents
 from suturetrack.types import Float32, Float64, Int64
 
 ARM = 14

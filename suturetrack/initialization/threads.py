@@ -17,7 +17,7 @@ from suturetrack.initialization.doubts import FADES, Doubt, doubts, joining
 from suturetrack.initialization.joints import Joints, inward
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
-from suturetrack.metrics import arc_lengths, nearest_index, polyline_distances, resample
+from suturetrack.polylines import arc_lengths, nearest_index, polyline_distances, resample
 from suturetrack.types import Float32, Float64
 
 _FAINT = 0.4

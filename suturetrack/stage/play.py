@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from suturetrack.metrics import polyline_length
+from suturetrack.polylines import polyline_length
 from suturetrack.stage.motion import Motion, Warp, load_motion, smoothing_matrix
 from suturetrack.stage.scenarios import Scenario
 from suturetrack.types import Float64

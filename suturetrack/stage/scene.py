@@ -6,7 +6,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import tubes
-from suturetrack.metrics import polyline_length
+from suturetrack.polylines import polyline_length
 from suturetrack.stage import appearance, background, clutter
 from suturetrack.stage.appearance import COLOURS, LIMITS, Look, Picture
 from suturetrack.stage.background import TEXTURES

@@ -6,7 +6,7 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
-from suturetrack.metrics import arc_lengths
+from suturetrack.polylines import arc_lengths
 from suturetrack.tracking.reliability import ASTRAY, EVENLY, RELIABILITY_SAMPLES
 from suturetrack.tracking.sampling import values_at, views_at
 from suturetrack.types import Bool, Float64, Nurbs

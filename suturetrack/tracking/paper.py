@@ -22,8 +22,8 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
-from suturetrack.metrics import arc_lengths
 from suturetrack.nurbs import curve_from, evenly_spaced
+from suturetrack.polylines import arc_lengths
 from suturetrack.tracking.config import PaperConfig
 from suturetrack.tracking.sampling import Samples, View, views
 from suturetrack.types import Float32, Float64, Nurbs, RidgeField

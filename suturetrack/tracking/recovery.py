@@ -15,8 +15,8 @@ from suturetrack.initialization import (
     initialize,
 )
 from suturetrack.kernels import search
-from suturetrack.metrics import polyline_distances, polyline_length
 from suturetrack.nurbs import evaluate, reversed_curve, tangents
+from suturetrack.polylines import polyline_distances, polyline_length
 from suturetrack.tracking.clearness import clear
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower

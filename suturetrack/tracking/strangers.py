@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from suturetrack.metrics import polyline_length
+from suturetrack.polylines import polyline_length
 from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import View, resampled, views_at
 from suturetrack.tracking.strands import Neighbours

@@ -6,8 +6,8 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, PlacedDoubts, remaining
-from suturetrack.metrics import nearest_index, resample
 from suturetrack.nurbs import evaluate
+from suturetrack.polylines import nearest_index, resample
 from suturetrack.tracking.sampling import length_of
 from suturetrack.types import Float64, Nurbs
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
-from suturetrack.metrics import nearest_index
 from suturetrack.nurbs import evaluate
+from suturetrack.polylines import nearest_index
 from suturetrack.tracking.clearness import Clearness
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.images import Images
