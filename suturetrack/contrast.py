@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 from suturetrack.kernels.ridge import gaussian_taps
+from suturetrack.polylines import unit
 from suturetrack.types import Float64, Image
 
 SIGMAS = (1.2, 2.4, 4.8, 9.6)
@@ -159,9 +160,7 @@ def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
         pixels: (N, 2) inside that image, in order along the thread, N >= 8.
         sigma: scale that suits the thread's width, px.
     """
-    tangents = np.gradient(pixels, axis=0)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
-    normals = tangents[:, ::-1] * (-1, 1)
+    normals = unit(np.gradient(pixels, axis=0))[:, ::-1] * (-1, 1)
     across, clutter = [], []
     for i in np.linspace(0, len(pixels) - 1, min(_WINDOWS, len(pixels))).round().astype(int):
         crop, centre = _window(image, pixels[i], _HALF_PX)

@@ -1,4 +1,4 @@
-"""Lines through ordered points: lengths, places, tangents and distances."""
+"""Lines through ordered points: lengths, places, directions and distances."""
 
 from __future__ import annotations
 
@@ -33,6 +33,11 @@ def polyline_tangents(points: Float64) -> Float64:
     """(k, dim) unit tangents at evenly spaced points."""
     steps = np.gradient(points, axis=0)
     return steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), np.finfo(float).tiny)
+
+
+def unit(vectors: Float64) -> Float64:
+    """(..., dim) vectors at length 1; those of next to no length stay so."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
 
 
 def nearest_index(points: Float64, place: Float64) -> int:

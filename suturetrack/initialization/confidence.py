@@ -28,6 +28,7 @@ from suturetrack.polylines import (
     polyline_at,
     polyline_distances,
     polyline_length,
+    unit,
 )
 from suturetrack.types import Float64, Int64, Nurbs
 
@@ -269,8 +270,7 @@ def _is_all_ridge(place: Float64, line: Float64, near: Int64, ridges: Ridges) ->
 
 def _bends_sharply(passing: Float64) -> bool:
     even = polyline_at(passing, np.arange(0.0, arc_lengths(passing)[-1], 1.0))
-    steps = even[_BEND_REACH:] - even[:-_BEND_REACH]
-    steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
+    steps = unit(even[_BEND_REACH:] - even[:-_BEND_REACH])
     return bool(((steps[_BEND_REACH:] * steps[:-_BEND_REACH]).sum(1) < _SHARP_COSINE).any())
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.kernels import search
+from suturetrack.polylines import unit
 from suturetrack.types import Bool, Float64, Int64
 
 _CLEAR = 2
@@ -158,8 +159,7 @@ def _evidence(
     ridges: Ridges, bridges: Float64, config: InitializationConfig
 ) -> tuple[Float64, Float64]:
     """Share of each of (m, k, 2) bridges that is on ridge of its direction, and the least ||V||."""
-    tangents = np.gradient(bridges, axis=1)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=2, keepdims=True), 1e-9)
+    tangents = unit(np.gradient(bridges, axis=1))
     flat = bridges.reshape(-1, 2)
     along = search.responses(ridges.field, flat, tangents.reshape(-1, 2))
     share = np.clip(along.reshape(bridges.shape[:2]) / config.high, 0, 1).mean(1)

@@ -11,6 +11,7 @@ from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.crest import Crest, View, find_crest
 from suturetrack.initialization.ends import EndReading, read_end
+from suturetrack.polylines import unit
 from suturetrack.types import Float64, Nurbs
 
 _SPACING_PX = 2.0
@@ -71,8 +72,7 @@ class Samples:
         points = nurbs.evaluate(curve, s)
         pixels = rig.project(points)
         left, right = (find_crest(v, p) for v, p in zip(views, pixels, strict=True))
-        outward = np.array([[p[0] - p[1], p[-1] - p[-2]] for p in pixels])
-        outward /= np.maximum(np.linalg.norm(outward, axis=2, keepdims=True), 1e-9)
+        outward = unit(np.array([[p[0] - p[1], p[-1] - p[-2]] for p in pixels]))
         ends_left, ends_right = (
             (read_end(v.field, p), read_end(v.field, p[::-1]))
             for v, p in zip(views, pixels, strict=True)

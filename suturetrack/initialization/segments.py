@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.kernels import crest, search
-from suturetrack.polylines import nearest_index, polyline_tangents
+from suturetrack.polylines import nearest_index, polyline_tangents, unit
 from suturetrack.types import Float32, Float64, Int64
 
 ARM = 14
@@ -200,8 +200,7 @@ def _kinks(segment: Float64) -> list[int]:
     """Where a segment turns sharply, the sharpest place of each turn."""
     if len(segment) <= 2 * _KINK_REACH:
         return []
-    steps = segment[_KINK_REACH:] - segment[:-_KINK_REACH]
-    steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
+    steps = unit(segment[_KINK_REACH:] - segment[:-_KINK_REACH])
     cosine = (steps[:-_KINK_REACH] * steps[_KINK_REACH:]).sum(1)
     kinks = np.flatnonzero(
         (cosine < _KINK) & (cosine <= minimum_filter1d(cosine, 2 * _KINK_REACH + 1))
@@ -226,8 +225,7 @@ def chain_tangents(pixels: Float64) -> Float64:
     """(k, 2) unit tangents of a chain with points one pixel apart."""
     ahead = pixels[np.minimum(np.arange(len(pixels)) + _CHORD, len(pixels) - 1)]
     behind = pixels[np.maximum(np.arange(len(pixels)) - _CHORD, 0)]
-    t = ahead - behind
-    return t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-9)
+    return unit(ahead - behind)
 
 
 def _sub_pixel(field: Float32, magnitude: Float32, pixels: Float64) -> Float64:

@@ -14,6 +14,7 @@ from suturetrack.initialization.hairpins import double_stubs
 from suturetrack.initialization.joints import Joints, Pair, inward
 from suturetrack.initialization.pricing import FREE_END, HIGHEST, Merge, price_merges
 from suturetrack.initialization.segments import ARM, Ridges
+from suturetrack.polylines import unit
 
 _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""
@@ -88,8 +89,7 @@ def _facing(ends: list[int], ridges: Ridges) -> list[Pair]:
     """Pairs of ends, near each other, of segments of like strength that point at each other."""
     arms = [inward(ridges.segments, end)[: ARM + 1] for end in ends]
     places = np.array([arm[0] for arm in arms])
-    heading = places - [arm[-1] for arm in arms]
-    heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-9)
+    heading = unit(places - [arm[-1] for arm in arms])
     strength = np.array([np.median(ridges.sample(ridges.segments[end // 2])) for end in ends])
     a, b = cKDTree(places).query_pairs(_LONGEST_HIDDEN_PX, output_type="ndarray").T
     way = places[b] - places[a]

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from suturetrack.camera import StereoRig
+from suturetrack.polylines import unit
 from suturetrack.segmentation.shutter import SLOWEST_PX, Shutter
 from suturetrack.types import Bool, Float32, Float64, Image
 
@@ -155,8 +156,7 @@ def _steps_across(pixels: Float64, before: Float64) -> Float64:
 
 
 def _tangents(pixels: Float64) -> Float64:
-    along = np.gradient(pixels, axis=0)
-    return along / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    return unit(np.gradient(pixels, axis=0))
 
 
 def _turned(vectors: Float64) -> Float64:
