@@ -93,21 +93,17 @@ class Contrast:
     def follow(self, seen: Contrast, share: float) -> Contrast:
         """`share` of the way to what was `seen`; this one where that was hardly the same thread."""
         metric = np.linalg.inv(self.clutter + seen.clutter)
-        ours, theirs, both = (
-            a @ metric @ b
-            for a, b in ((self.across,) * 2, (seen.across,) * 2, (self.across, seen.across))
-        )
+        ours, theirs = (across @ metric @ across for across in (self.across, seen.across))
+        both = self.across @ metric @ seen.across
         distinct = seen.stands_out(seen.weights) >= _LEAST_SCORE
         if not distinct or both < _ALIKE * math.sqrt(ours * theirs):
             return self
-        weights, across, clutter = (
-            (1 - share) * old + share * new
-            for old, new in (
-                (self.weights, seen.weights),
-                (self.across, seen.across),
-                (self.clutter, seen.clutter),
-            )
-        )
+
+        def between(old: Float64, new: Float64) -> Float64:
+            return (1 - share) * old + share * new
+
+        weights = between(self.weights, seen.weights)
+        across, clutter = between(self.across, seen.across), between(self.clutter, seen.clutter)
         return Contrast(weights / np.abs(weights).sum(), across, clutter, self.sigma)
 
     def fainter(self, share: float, clear: Contrast) -> Contrast:
