@@ -23,7 +23,7 @@ import numpy as np
 
 from suturetrack.kernels.ridge import gaussian_taps
 from suturetrack.polylines import unit
-from suturetrack.types import Float64, Image
+from suturetrack.types import Float64, Image, Int64
 
 SIGMAS = (1.2, 2.4, 4.8, 9.6)
 """Scales at which a thread is looked for, px: the first one in the image and its halves."""
@@ -36,7 +36,8 @@ _WINDOW_PX, _NEAR_PX = 128, 64
 _SNAP_PX = 8
 # Fewest pixels of a halved image within which a ridge is looked for.
 _LEAST_SNAP_PX = 2
-_STARTS = 4
+# Pixels from which ridges are followed, and px between them.
+_STARTS, _APART_PX = 4, 2
 _ROUNDS = 2
 _SHORTEST_PX = 20
 # Threads stand out from the clutter by 2.1 to 6.6 (median 4), textures by up to 2.2 (median 0.5).
@@ -291,7 +292,7 @@ def _starts(scene: _Scene, seed: Float64, reach: float) -> list[tuple[int, int]]
     v, u = v[near], u[near]
     unlike = _most_unlike(scene, v, u)[0]
     unlike *= _nearness(np.stack([u, v], axis=1), seed, reach) ** 2
-    return [(int(v[i]), int(u[i])) for i in _peaks(unlike, v, u, apart=2)]
+    return [(int(v[i]), int(u[i])) for i in _peaks(unlike, v, u)]
 
 
 def _nearness(pixels: Float64, seed: Float64, reach: float) -> Float64:
@@ -299,17 +300,17 @@ def _nearness(pixels: Float64, seed: Float64, reach: float) -> Float64:
     return np.asarray(np.exp(-np.sum((pixels - seed) ** 2, axis=1) / (2 * reach**2)))
 
 
-def _peaks(values: Float64, v: Float64, u: Float64, apart: float) -> list[int]:
-    """Which of the pixels have the highest values, one after the other; `apart` px between them."""
+def _peaks(values: Float64, v: Int64, u: Int64) -> list[int]:
+    """Which of the (N,) pixels have the highest values, one after the other."""
     left, peaks = values.copy(), []
     for _ in range(_STARTS):
         best = int(np.argmax(left))
         peaks.append(best)
-        left[np.hypot(u - u[best], v - v[best]) <= apart] = 0
+        left[np.hypot(u - u[best], v - v[best]) <= _APART_PX] = 0
     return peaks
 
 
-def _most_unlike(scene: _Scene, v: Float64, u: Float64) -> tuple[Float64, Float64]:
+def _most_unlike(scene: _Scene, v: Int64, u: Int64) -> tuple[Float64, Float64]:
     """(N,) how unlike the nuisance pixels are, and (N, channels) second derivatives that show it."""
     theta = (np.arange(16) * math.pi / 16)[:, None, None]
     uu, uv, vv = scene.hessian[:, v, u]

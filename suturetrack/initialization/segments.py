@@ -228,8 +228,8 @@ def chain_tangents(pixels: Float64) -> Float64:
     return unit(ahead - behind)
 
 
-def _sub_pixel(field: Float32, magnitude: Float32, pixels: Float64) -> Float64:
-    """Moves pixels along the normal to the vertex of the parabola through three values of ||V||."""
+def _sub_pixel(field: Float32, magnitude: Float32, pixels: Int64) -> Float64:
+    """Moves (k, 2) pixels along the normal to the vertex of the parabola through three values of ||V||."""
     v = field[pixels[:, 1], pixels[:, 0]]
     centre = magnitude[pixels[:, 1], pixels[:, 0]].astype(float)
     normals = np.c_[-v[:, 1], v[:, 0]] / centre[:, None]
