@@ -18,6 +18,7 @@ _PENALTY = 0.8
 _BEYOND_PX = 25.0
 """How far disparities may lie from those of the thread, px."""
 _LEAST_RESPONSE = 0.45
+"""Response of the other view, against the own one, from which a point has a disparity."""
 _LEAST_SLOPE = 0.2
 """Sine of the angle to the epipolar lines from which a point has a disparity."""
 _SKIPPED = 4
@@ -47,9 +48,13 @@ class Depth:
     """Finds arms of one view in the other, at disparities about those of the thread."""
 
     own: Float32
+    """(H, W, 2) field of the arms' view."""
     other: Float32
+    """(H, W, 2) field of the other view."""
     lowest: float
+    """The least disparity u_own - u_other that is looked at, px."""
     states: int
+    """How many of them, `_STATE_PX` apart."""
 
     @classmethod
     def around(cls, disparities: Float64, own: Float32, other: Float32) -> Depth:

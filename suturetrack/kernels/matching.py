@@ -8,7 +8,7 @@ import numpy as np
 from suturetrack.types import Float32, Float64, Int64
 
 UNSEEN = 0.5
-"""Cost of a place that lies outside the right image."""
+"""Cost of a place that lies outside the other image."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -21,13 +21,13 @@ def matching_costs(
     count: int,
     level: float,
 ) -> Float32:
-    """(k, count) 1 where the right view shows no thread at a disparity, 0 where it surely does.
+    """(k, count) 1 where the other view shows no thread at a disparity, 0 where it surely does.
 
     Args:
-        field: (H, W, 2) right view.
-        pixels: (k, 2) along the thread in the left view.
+        field: (H, W, 2) other view.
+        pixels: (k, 2) along the thread in its own view.
         tangents: (k, 2) unit tangents there.
-        first: the disparity u_left - u_right of state 0, px.
+        first: the disparity u_own - u_other of state 0, px.
         step: px from state to state.
         count: number of states.
         level: response of eq. (4) that a thread is known to give.
