@@ -63,22 +63,14 @@ def tangents(curve: Nurbs, s: Float64) -> Float64:
 
 def length(curve: Nurbs) -> float:
     """Arc length, by Gauss-Legendre quadrature on each knot span."""
-    edges = np.unique(curve.knots)
-    nodes, weights = np.polynomial.legendre.leggauss(8)
-    half = np.diff(edges)[:, None] / 2
-    s = edges[:-1, None] + half * (nodes + 1)
-    speed = np.linalg.norm(derivative(curve, s.ravel()), axis=-1).reshape(s.shape)
-    return float(np.sum(speed * weights * half))
+    s, weights, half = _between(np.unique(curve.knots), 8)
+    return float(np.sum(_speed(curve, s) * weights * half))
 
 
 def arc_lengths(curve: Nurbs, s: Float64) -> Float64:
     """Arc length from the start to each of the sorted parameters `s`, by Gauss-Legendre between them."""
-    edges = np.r_[0.0, np.asarray(s, float)]
-    nodes, weights = np.polynomial.legendre.leggauss(4)
-    half = np.diff(edges)[:, None] / 2
-    inner = edges[:-1, None] + half * (nodes + 1)
-    speed = np.linalg.norm(derivative(curve, inner.ravel()), axis=-1).reshape(inner.shape)
-    return np.cumsum(np.sum(speed * weights * half, axis=1))
+    inner, weights, half = _between(np.r_[0.0, np.asarray(s, float)], 4)
+    return np.cumsum(np.sum(_speed(curve, inner) * weights * half, axis=1))
 
 
 def evenly_spaced(curve: Nurbs, count: int) -> Float64:
@@ -112,12 +104,9 @@ def fit(points: Float64, s: Float64, knots: Float64, degree: int, smoothing: flo
 
 def bending_matrix(knots: Float64, degree: int) -> Float64:
     """(n + 1, n + 1) matrix B with c.T B c = integral of |f''(s)|^2 ds, exact."""
-    edges = np.unique(knots)
-    nodes, weights = np.polynomial.legendre.leggauss(max(degree - 1, 1))
-    half = np.diff(edges)[:, None] / 2
-    s = (edges[:-1, None] + half * (nodes + 1)).ravel()
+    s, weights, half = _between(np.unique(knots), max(degree - 1, 1))
     count = len(knots) - degree - 1
-    second = np.asarray(BSpline(knots, np.eye(count), degree)(s, 2))
+    second = np.asarray(BSpline(knots, np.eye(count), degree)(s.ravel(), 2))
     return second.T @ ((weights * half).ravel()[:, None] * second)
 
 
@@ -167,6 +156,18 @@ def _with_stop(c: Float64, t: Float64, stop: float) -> tuple[Float64, Float64]:
     c[-2] = c[-3] + b * (one - c[-3])
     c[-1] = c[-2] + g * (one + g * (two - one) - c[-2])
     return c, np.r_[t[:-4], np.full(4, stop)]
+
+
+def _between(edges: Float64, count: int) -> tuple[Float64, Float64, Float64]:
+    """Gauss-Legendre's rule between m + 1 edges: (m, count) places, (count,) weights, (m, 1) half widths."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    half = np.diff(edges)[:, None] / 2
+    return edges[:-1, None] + half * (nodes + 1), weights, half
+
+
+def _speed(curve: Nurbs, s: Float64) -> Float64:
+    """(m, count) |f'(s)| at (m, count) parameters."""
+    return np.linalg.norm(derivative(curve, s.ravel()), axis=-1).reshape(s.shape)
 
 
 def _homogeneous(curve: Nurbs) -> BSpline:
