@@ -11,7 +11,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.nurbs import curve_from
 from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.reliability import Evidence
-from suturetrack.tracking.sampling import View, distinct, length_of, views_at
+from suturetrack.tracking.sampling import View, distinct, greville, length_of, views_at
 from suturetrack.tracking.strands import Neighbours, Strand
 from suturetrack.types import Float64, Nurbs
 
@@ -90,12 +90,11 @@ def _views(evidence: Evidence, stretch: Stretch, rig: StereoRig) -> tuple[View, 
 
 def _bridged(curve: Nurbs, stretch: Stretch) -> Nurbs:
     """The curve with the least change of bending along the stretch."""
-    knots, points = curve.knots, curve.control_points.copy()
-    middles = (knots[1:-3] + knots[2:-2] + knots[3:-1]) / 3  # Greville's, where control points act.
-    free = (stretch[0] < middles) & (middles < stretch[1])
+    points, s = curve.control_points.copy(), greville(curve.knots)
+    free = (stretch[0] < s) & (s < stretch[1])
     third = _third_derivatives(curve)
     points[free] = np.linalg.lstsq(third[:, free], -third[:, ~free] @ points[~free], rcond=None)[0]
-    return curve_from(curve.degree, knots, points)
+    return curve_from(curve.degree, curve.knots, points)
 
 
 def _third_derivatives(curve: Nurbs) -> Float64:

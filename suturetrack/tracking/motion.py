@@ -9,7 +9,7 @@ import numpy as np
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import spline
 from suturetrack.nurbs import clamped_knots, curve_from
-from suturetrack.tracking.sampling import Samples, derivatives_at, values_at, views
+from suturetrack.tracking.sampling import Samples, derivatives_at, greville, values_at, views
 from suturetrack.types import Bool, Float64, Nurbs
 
 _KNOTS = clamped_knots(np.linspace(0, 1, 6)[1:-1], spline.DEGREE)
@@ -38,9 +38,7 @@ class Motion:
         """The cubic curve after `seconds`; where it is after a long or backward step in time."""
         if not 0 < seconds <= _LONGEST_STEP_S:
             return curve
-        knots = curve.knots
-        s = (knots[1:-3] + knots[2:-2] + knots[3:-1]) / spline.DEGREE
-        step = spline.evaluate(s, _KNOTS, self.coefficients)[0] * seconds
+        step = spline.evaluate(greville(curve.knots), _KNOTS, self.coefficients)[0] * seconds
         return curve_from(curve.degree, curve.knots, curve.control_points + step)
 
     def learn(

@@ -118,6 +118,11 @@ def resampled(flags: Bool, s: Float64) -> Bool:
     return np.interp(s, np.linspace(0, 1, len(flags)), flags) > 0.5
 
 
+def greville(knots: Float64) -> Float64:
+    """(n + 1,) Greville's parameters, at which the control points of a cubic curve act."""
+    return (knots[1:-3] + knots[2:-2] + knots[3:-1]) / spline.DEGREE
+
+
 def distinct(knots: Float64) -> Float64:
     """The sorted knots, each once."""
     is_new = np.ones(len(knots), bool)
