@@ -9,7 +9,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import initialize
 from suturetrack.initialization.arms import Arms
 from suturetrack.initialization.depth import Depth
-from suturetrack.initialization.pricing import Merge
+from suturetrack.initialization.pricing import Merges
 from suturetrack.metrics import curve_error
 from suturetrack.types import Float32, Float64, Nurbs, Seed
 from tests.test_initialization import dense, draw, field_of
@@ -55,7 +55,7 @@ def test_a_step_in_depth_makes_a_merge_dearer(
 ) -> None:
     arms = crossing()
     left, right = two_views(arms, [DISPARITY, *(DISPARITY + s for s in steps)], rig)
-    merges = Merge(np.array([[0, 2], [0, 4]]), np.array([0.3, 0.3]), np.zeros(2, bool))
+    merges = Merges(np.array([[0, 2], [0, 4]]), np.array([0.3, 0.3]), np.zeros(2, bool))
     depth = Depth.around(np.full(10, DISPARITY), left, right)
     cost = Arms(tuple(arms), {}, merges, depth).with_depth(merges).cost
     assert cost[dearer] > cost[1 - dearer] + 0.2
@@ -68,7 +68,7 @@ def test_a_step_in_depth_makes_a_merge_dearer(
 def test_strands_that_cross_go_straight_on() -> None:
     run = np.arange(8.0, 69.0)
     ends = [np.c_[300 + way * run, 200 + side * 0.7 * run] for way in (-1, 1) for side in (-1, 1)]
-    merges = Merge(np.empty((0, 2), np.int64), np.empty(0), np.empty(0, bool))
+    merges = Merges(np.empty((0, 2), np.int64), np.empty(0), np.empty(0, bool))
     crossing_arms = Arms(tuple(ends), {}, merges, None)
     straight, touching = [(0, 6), (2, 4)], [(0, 4), (2, 6)]
     change = crossing_arms.change(straight, touching)

@@ -10,7 +10,7 @@ from scipy.linalg import cho_solve, cholesky
 
 from suturetrack.initialization.depth import Depth, Disparities
 from suturetrack.initialization.joints import Pair, inward
-from suturetrack.initialization.pricing import Merge
+from suturetrack.initialization.pricing import Merges
 from suturetrack.polylines import arc_lengths
 from suturetrack.types import Float64
 
@@ -44,7 +44,7 @@ class Arms:
         self,
         segments: Sequence[Float64],
         partner: dict[int, int],
-        merges: Merge | None,
+        merges: Merges | None,
         depth: Depth | None,
     ) -> None:
         self._segments, self._partner, self._depth = segments, partner, depth
@@ -57,14 +57,14 @@ class Arms:
         """The arms as far as the segments go by themselves, whoever may share them."""
         return Arms(self._segments, {}, None, self._depth)
 
-    def with_depth(self, merges: Merge) -> Merge:
+    def with_depth(self, merges: Merges) -> Merges:
         """The merges, those dearer whose arms differ in depth."""
         cost = merges.cost.copy()
         for k in np.flatnonzero(cost < _LIKELY):
             i, j = merges.pairs[k].tolist()
             if min(self._lead(i), self._lead(j)) < _RIVAL:
                 cost[k] += ENERGY * self._step(i, j)
-        return Merge(merges.pairs, cost, merges.touching)
+        return Merges(merges.pairs, cost, merges.touching)
 
     def change(self, pairs: list[Pair], others: list[Pair]) -> float | None:
         """What it would cost if the arms of some ends were joined as `others`, and not as `pairs`;
@@ -130,7 +130,7 @@ class Arms:
         return np.concatenate(points)[:REACH]
 
 
-def _leads(merges: Merge) -> dict[int, float]:
+def _leads(merges: Merges) -> dict[int, float]:
     """How much dearer the second best merge of an end is than its best."""
     costs: dict[int, list[float]] = {}
     for pair, cost in zip(merges.pairs.tolist(), merges.cost.tolist(), strict=True):

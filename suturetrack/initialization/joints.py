@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from suturetrack.initialization.pricing import FREE_END, HIGHEST, Merge
+from suturetrack.initialization.pricing import FREE_END, HIGHEST, Merges
 from suturetrack.types import Float64, Int64
 
 _OUT_OF_REACH = 2.0
@@ -41,7 +41,7 @@ class Joints:
     """Which segment each copy is of."""
 
     @classmethod
-    def priced(cls, segments: Iterable[Float64], merges: Merge) -> Joints:
+    def priced(cls, segments: Iterable[Float64], merges: Merges) -> Joints:
         """With nothing joined yet."""
         pairs, costs = merges.pairs.tolist(), merges.cost.tolist()
         price = {(i, j): cost for (i, j), cost in zip(pairs, costs, strict=True)}

@@ -37,7 +37,7 @@ HIGHEST = 2 * FREE_END
 
 
 @dataclass(frozen=True, eq=False)
-class Merge:
+class Merges:
     """What joining pairs of ends would cost; end 2i is the start of segment i, 2i + 1 its end."""
 
     pairs: Int64
@@ -80,7 +80,7 @@ class _Tips:
 
 
 @lru_cache(maxsize=4)  # Each view is asked about several times.
-def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
+def price_merges(ridges: Ridges, config: InitializationConfig) -> Merges:
     """Prices every pair of ends within reach: whether one smooth curve runs through both segments,
     over ridge, at one strength."""
     tips = _Tips.of(ridges.segments, _CLEAR)
@@ -99,7 +99,7 @@ def price_merges(ridges: Ridges, config: InitializationConfig) -> Merge:
     shape[hooked] = np.minimum(shape[hooked], others)
     ratio = np.minimum(*(abs(np.log(s[i] / s[j])) for s in (near, whole)))
     cost = shape + 0.25 * ratio**2 + _SHORT * np.maximum(short[i], short[j])
-    return Merge(pairs, cost, (distance < TOUCHING_PX) & (weakest >= config.low))
+    return Merges(pairs, cost, (distance < TOUCHING_PX) & (weakest >= config.low))
 
 
 def _tip(segment: Float64, clear: int) -> Float64:

@@ -12,7 +12,7 @@ from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.hairpins import double_stubs
 from suturetrack.initialization.joints import Joints, Pair, inward
-from suturetrack.initialization.pricing import FREE_END, HIGHEST, Merge, price_merges
+from suturetrack.initialization.pricing import FREE_END, HIGHEST, Merges, price_merges
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.polylines import unit
 
@@ -44,7 +44,7 @@ def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None
     return _merge(ridges, arms.with_depth(merges), arms)
 
 
-def _merge(ridges: Ridges, merges: Merge, arms: Arms | None) -> Joints:
+def _merge(ridges: Ridges, merges: Merges, arms: Arms | None) -> Joints:
     joints = Joints.priced(ridges.segments, merges)
     order = np.argsort(merges.cost)
     joints.join_free(merges.pairs[order[merges.cost[order] < HIGHEST]])
