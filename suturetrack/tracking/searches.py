@@ -73,23 +73,23 @@ class Again:
     """What its length has to be one of, if anything."""
     rig: StereoRig
     """With the rows on which the last curve was held."""
-    before: tuple[Follower, ...]
+    before: tuple[Follower, ...] = ()
     """Who knows how long the thread is."""
-    level: float | None
+    level: float | None = None
     """How clearly the left view showed it, where it may be anywhere by now; None while it is held."""
-    turn: int | None
+    turn: int | None = None
     """From which of the places a brief search begins; None for one that takes all the time."""
 
     def find(self, field: RidgeField) -> Found:
         """A thread of the known length."""
         starts = starts_on(self.last, self.seed, field, self.rig)
-        is_brief, first = self.turn is not None, (self.turn or 0) % len(starts)
+        first = (self.turn or 0) % len(starts)
         starts = starts[first:] + starts[:first]
-        wanted, setup = (self.last, self.known_lengths), self.setup
-        found = find_again(*wanted, starts, field, setup, is_brief=is_brief)
+        last, known, setup = self.last, self.known_lengths, self.setup
+        found = find_again(last, known, starts, field, setup, is_brief=self.turn is not None)
         if found is not None or self.level is None:
             return found
-        return find_elsewhere(*wanted, self.level, field, setup, self.seed.thread)
+        return find_elsewhere(last, known, self.level, field, setup, self.seed.thread)
 
     def beside(self, others: Neighbours, found: Initialization) -> Found:
         """What was found, unless it is one of the other threads."""

@@ -131,18 +131,15 @@ class Thread:
             others: strands of the other threads that are held.
             all_held: whether these are all; what moves may be one that is not held.
         """
-        was_lost = not self.is_held
         if self._pursuit is None:
             self._state = replace(self._state, events=())
             return
         state = self._pursuit.step(field, others)
-        levels = self._pursuit.follower.model.levels
-        self._clearness.step(field, levels, is_lost=state.status is Status.LOST)
-        if state.status is not Status.LOST and was_lost:
-            state = replace(state, events=("recovered", *state.events))
-        elif state.status is Status.LOST and not was_lost:
-            state = replace(state, events=("lost", *state.events))
-        if state.status is not Status.LOST and all_held:
+        was_lost, is_lost = not self.is_held, state.status is Status.LOST
+        self._clearness.step(field, self._pursuit.follower.model.levels, is_lost=is_lost)
+        if is_lost != was_lost:
+            state = replace(state, events=("lost" if is_lost else "recovered", *state.events))
+        if all_held and not is_lost:
             self._look_for_strangers(state, field, others)
         else:
             self._strangers = self._strangers.of_another()
@@ -165,8 +162,7 @@ class Thread:
     def _come_to(self, state: ThreadState) -> None:
         """What is not sure to be the thread is not called so."""
         self._followed = state
-        is_sure = self._is_sure
-        is_sure &= not self._strangers.is_found
+        is_sure = self._is_sure and not self._strangers.is_found
         if is_sure:
             self._was_sure, self._known = True, copy.copy(self.follower)
             self._looks_in_vain = 0
@@ -182,13 +178,14 @@ class Thread:
         """
         if self.is_sought:
             search = self._search_from_seed()
-        elif self._state.curve is None:
+        elif not self.is_known:
             search = None
         elif self.is_astray:
             search = self._search_again(is_beside)
         else:
             search = self._search_closer(now_ns)
-        self.looked_ns = now_ns if search else self.looked_ns
+        if search is not None:
+            self.looked_ns = now_ns
         return search
 
     def _search_from_seed(self) -> Search:
@@ -196,28 +193,28 @@ class Thread:
         return FromSeed(self._sought, self._setup, self._state.curve)
 
     def _search_again(self, is_beside: bool) -> Search | None:
+        if self._rests():
+            return None
+        seed, setup, held = self._seed, self._setup, self.follower
+        turn = self._attempts - 1 if is_beside else None
+        if held is None:
+            assert self._state.curve is not None
+            known = (self._state.length,) if self._attempts <= _QUICK_ATTEMPTS else ()
+            return Again(seed, setup, self._state.curve, known, setup.rig, turn=turn)
+        knows = self._looks_in_vain < _LOOKS
+        knows &= self._attempts <= _ATTEMPTS or self._attempts % 2 == 0
+        before = self._who_knows_its_length() if knows else ()
+        level = None if self.is_held else held.model.levels[0]
+        return Again(seed, setup, held.last_good, lengths(before), held.rig, before, level, turn)
+
+    def _rests(self) -> bool:
+        """Whether this field is one between two attempts; counts both."""
         if self._fields_to_rest <= 0:
             self._fields_to_rest = _REST << min(max(self._attempts - _QUICK_ATTEMPTS, 0), _RAREST)
             self._attempts += 1
-        else:
-            self._fields_to_rest -= 1
-            if not self._clearness.is_back:
-                return None
-        turn = self._attempts - 1 if is_beside else None
-        if self.follower is not None:
-            held, knows = self.follower, self._looks_in_vain < _LOOKS
-            knows &= self._attempts <= _ATTEMPTS or self._attempts % 2 == 0
-            before = self._who_knows_its_length() if knows else ()
-            known = lengths(before)
-            level = None if self.is_held else held.model.levels[0]
-            return Again(
-                self._seed, self._setup, held.last_good, known, held.rig, before, level, turn
-            )
-        assert self._state.curve is not None
-        known = (self._state.length,) if self._attempts <= _QUICK_ATTEMPTS else ()
-        return Again(
-            self._seed, self._setup, self._state.curve, known, self._setup.rig, (), None, turn
-        )
+            return False
+        self._fields_to_rest -= 1
+        return not self._clearness.is_back
 
     def _search_closer(self, now_ns: int) -> Search | None:
         assert self.follower is not None
