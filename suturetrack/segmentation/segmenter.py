@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,17 @@ _FADE = 0.5
 _FEWEST_PIXELS = 8
 
 
+@dataclass(eq=False)
+class _Learned:
+    """A thread that was learned."""
+
+    contrast: Contrast
+    clear: Contrast
+    """As it was when it was seen last."""
+    sight: Sight
+    course: Course
+
+
 class Segmenter:
     """Turns stereo frames into ridge vector fields.
 
@@ -43,15 +54,11 @@ class Segmenter:
     def __init__(self, rig: StereoRig, config: SegmentationConfig = SegmentationConfig()) -> None:
         self._rig = rig
         self._config = config
-        self._threads: dict[str, Contrast] = {}
-        self._clear: dict[str, Contrast] = {}
-        """As they were when they were seen last."""
+        self._learned: dict[str, _Learned] = {}
         self._seeded: set[str] = set()
         self._before: dict[str, tuple[Contrast, Contrast]] = {}
-        """Of threads that are looked for from another seed: the same two, as they were before it."""
+        """Of threads that are looked for from another seed: both contrasts, as they were before it."""
         self._first = Sight(rig, config, first_look(config))
-        self._sights: dict[str, Sight] = {}
-        self._courses: dict[str, Course] = {}
         self._all: Float32 | None = None
         self._steps = 0
         self._is_cut_out = False
@@ -59,12 +66,12 @@ class Segmenter:
     @property
     def threads(self) -> tuple[str, ...]:
         """Names of the threads that were learned."""
-        return tuple(self._threads)
+        return tuple(self._learned)
 
     @property
     def unlearned(self) -> frozenset[str]:
         """Names of the threads whose seeds have taught nothing."""
-        return frozenset(self._seeded - self._threads.keys())
+        return frozenset(self._seeded - self._learned.keys())
 
     def check(self, frame: StereoFrame) -> None:
         """Raises InputError unless the images are uint8, gray or BGR, of the rig's size, and alike."""
@@ -92,8 +99,8 @@ class Segmenter:
         self._steps += 1
         now_ns = frame.stamp.capture_ns
         own = {
-            name: sight.step(frame, slot, self._courses[name].bands(now_ns, self._rig))
-            for name, sight in self._sights.items()
+            name: thread.sight.step(frame, slot, thread.course.bands(now_ns, self._rig))
+            for name, thread in self._learned.items()
         }
         if len(own) > 1:
             return joined(frame.stamp, own, self._room_for_all(slot))
@@ -120,28 +127,26 @@ class Segmenter:
         if contrast is not None:
             if self._is_cut_out:
                 contrast = replace(contrast, sigma=max(silhouette_scale(frame.left), SIGMAS[0]))
-            self._clear[seed.thread] = contrast
-            self._look_for(seed.thread, contrast)
+            self._look_for(seed.thread, contrast, contrast)
 
     def remember(self, thread: str) -> None:
         """Keep aside what was learned of a thread, until another seed at it is settled."""
-        if thread in self._threads and thread not in self._before:
-            self._before[thread] = self._threads[thread], self._clear[thread]
+        known = self._learned.get(thread)
+        if known is not None:
+            self._before.setdefault(thread, (known.contrast, known.clear))
 
     def settle(self, thread: str, *, is_found: bool) -> None:
         """Keep what the seed has taught, if the thread was found from it, else what was remembered."""
         before = self._before.pop(thread, None)
         if before is not None and not is_found:
-            contrast, self._clear[thread] = before
-            self._look_for(thread, contrast)
+            self._look_for(thread, *before)
 
     def forget(self, thread: str) -> None:
         """Look for a thread no more; without any, look as before the first was learned."""
         self._seeded.discard(thread)
         self._before.pop(thread, None)
-        if self._threads.pop(thread, None) is not None:
-            del self._clear[thread], self._sights[thread], self._courses[thread]
-            self._is_cut_out &= bool(self._threads)
+        if self._learned.pop(thread, None) is not None:
+            self._is_cut_out &= bool(self._learned)
 
     def adapt(self, frame: StereoFrame, pixels: Float64, thread: str = "0") -> None:
         """Follow slow changes of the light: go a part of the way to what a held curve shows.
@@ -159,17 +164,15 @@ class Segmenter:
         frame = self._seen(frame)
         width, height = self._rig.image_size
         inside = (pixels >= 0).all(1) & (pixels <= (width - 1, height - 1)).all(1)
-        learned = self._config.adapt and thread in self._threads
-        if not learned or np.count_nonzero(inside) < _FEWEST_PIXELS:
+        known = self._learned.get(thread) if self._config.adapt else None
+        if known is None or np.count_nonzero(inside) < _FEWEST_PIXELS:
             return
-        old, clear = self._threads[thread], self._clear[thread]
-        seen = contrast_along(frame.left, pixels[inside], old.sigma)
+        seen = contrast_along(frame.left, pixels[inside], known.contrast.sigma)
         # What was lost may be as clear as before, or as faint as it was found again.
-        nearer = min(old, clear, key=lambda contrast: abs(contrast.strength - seen.strength))
+        nearer = min(known.contrast, known.clear, key=lambda c: abs(c.strength - seen.strength))
         followed = nearer.follow(seen, _ADAPT)
         if followed is not nearer:
-            self._clear[thread] = followed
-            self._look_for(thread, followed)
+            self._look_for(thread, followed, followed)
 
     def follow(self, capture_ns: int, points: Float64, thread: str = "0") -> None:
         """Know where a thread was, and so how fast it moves.
@@ -179,8 +182,8 @@ class Segmenter:
             points: (k, 3) evenly along its curve, rectified left frame, calibration's unit; always as many.
             thread: which thread this is; one that was never learned is left alone.
         """
-        if thread in self._courses:
-            self._courses[thread].learn(capture_ns, points)
+        if thread in self._learned:
+            self._learned[thread].course.learn(capture_ns, points)
 
     def fade(self, thread: str = "0") -> None:
         """Look for a thread that is lost as if it stood out less than before, down to a quarter of what
@@ -188,9 +191,9 @@ class Segmenter:
 
         Focus, smoke or light may have changed at once, when no curve is held that could show it.
         """
-        if not self._config.adapt or thread not in self._threads:
-            return
-        self._look_for(thread, self._threads[thread].fainter(_FADE, self._clear[thread]))
+        known = self._learned.get(thread) if self._config.adapt else None
+        if known is not None:
+            self._look_for(thread, known.contrast.fainter(_FADE, known.clear), known.clear)
 
     def warm_up(self) -> None:
         """Compile (or load) the kernels, so that the first frame is as quick as the next."""
@@ -206,14 +209,13 @@ class Segmenter:
     def _seen(self, frame: StereoFrame) -> StereoFrame:
         return silhouettes(frame) if self._is_cut_out else frame
 
-    def _look_for(self, thread: str, contrast: Contrast) -> None:
-        self._threads[thread] = contrast
-        look = learned_look(self._config, contrast)
-        if thread in self._sights:
-            self._sights[thread].look = look
+    def _look_for(self, thread: str, contrast: Contrast, clear: Contrast) -> None:
+        look, known = learned_look(self._config, contrast), self._learned.get(thread)
+        if known is None:
+            sight = Sight(self._rig, self._config, look)
+            self._learned[thread] = _Learned(contrast, clear, sight, Course())
         else:
-            self._sights[thread] = Sight(self._rig, self._config, look)
-            self._courses[thread] = Course()
+            known.contrast, known.clear, known.sight.look = contrast, clear, look
 
     def _room_for_all(self, slot: int) -> Pair:
         width, height = self._rig.image_size
