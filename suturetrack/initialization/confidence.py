@@ -100,33 +100,18 @@ def judge(
     pixels = rig.project(nurbs.evaluate(curve, np.linspace(0, 1, 32 * len(curve.control_points))))
     agreement = min(_agreement(p, c.pixels, rig) for p, c in zip(pixels, chains, strict=True))
     confidence, reasons = _of_the_whole(agreement, samples, sigma, nurbs.length(curve))
-    doubts = [_settled(_distinct(c), p, r) for c, p, r in zip(chains, pixels, ridges, strict=True)]
-    doubts = [_confirmed(view, doubts, pixels) for view in (0, 1)]
-    if max(_others(line, r) for line, r in zip(pixels, ridges, strict=True)) <= _NEXT_TO_NOTHING:
-        doubts = [[_of_itself(doubt) for doubt in of_view] for of_view in doubts]
-    for view, name in enumerate(("left", "right")):
-        places = np.array([pixel for pixel, _, _ in doubts[view]]).reshape(-1, 2)
-        said = in_words(places, rig, scale, right=bool(view))
-        whys = [why for _, why, _ in doubts[view]]
-        reasons += [f"{w} in the {name} view at {p}" for w, p in zip(whys, said, strict=True)]
+    doubts = _left_in_doubt(pixels, chains, ridges)
+    reasons += _in_words(doubts, rig, scale)
     further = [_ends_further_on(line, c.pixels) for line, c in zip(pixels, chains, strict=True)]
     left, right = (
         (*_placed(view, doubts, pixels, chains), *((float(end), _FURTHER) for end in further[view]))
         for view in (0, 1)
     )
     confidence *= remaining((left, right))
-    for end, ordinal in enumerate(("first", "last")):
-        reasons += [
-            f"the {name} view shows the {ordinal} end further on"
-            for name, ends in zip(("left", "right"), further, strict=True)
-            if end in ends
-        ]
-        readings = [samples.ends[view][end] for view in (0, 1)]
-        if any(r.at_border for r in readings):
-            reasons.append(f"{ordinal} end cut by the image border")
-        elif all(np.isnan(r.offset_px) for r in readings):
-            confidence *= _NO_END
-            reasons.append(f"{ordinal} end not seen as an end")
+    for end in (0, 1):
+        kept, whys = _of_an_end(end, samples, further)
+        confidence *= kept
+        reasons += whys
     return float(confidence), tuple(reasons), (left, right)
 
 
@@ -146,6 +131,47 @@ def _of_the_whole(
     if held < _HELD:
         reasons.append(f"uncertain depth: even its best parts to {vague:.1%} of the length only")
     return confidence * seen * held, reasons
+
+
+def _left_in_doubt(
+    lines: tuple[Float64, Float64], chains: tuple[Chain, Chain], ridges: tuple[Ridges, Ridges]
+) -> list[list[Doubt]]:
+    """What each view still doubts once the whole curve is known; `lines` are the curve in both views."""
+    doubts = [_settled(_distinct(c), p, r) for c, p, r in zip(chains, lines, ridges, strict=True)]
+    doubts = [_confirmed(view, doubts, lines) for view in (0, 1)]
+    if max(_others(line, r) for line, r in zip(lines, ridges, strict=True)) > _NEXT_TO_NOTHING:
+        return doubts
+    return [[_of_itself(doubt) for doubt in of_view] for of_view in doubts]
+
+
+def _in_words(doubts: list[list[Doubt]], rig: StereoRig, scale: int) -> list[str]:
+    """What each view doubts, and where."""
+    words = []
+    for view, name in enumerate(("left", "right")):
+        places = np.array([doubt.place for doubt in doubts[view]]).reshape(-1, 2)
+        said = in_words(places, rig, scale, right=bool(view))
+        words += [
+            f"{doubt.why} in the {name} view at {place}"
+            for doubt, place in zip(doubts[view], said, strict=True)
+        ]
+    return words
+
+
+def _of_an_end(end: int, samples: Samples, further: list[list[int]]) -> tuple[float, list[str]]:
+    """What an end (0 or 1) leaves of the confidence, and what is said of it; `further` are the ends behind
+    which the left and the right view's own thread goes on."""
+    ordinal = ("first", "last")[end]
+    reasons = [
+        f"the {name} view shows the {ordinal} end further on"
+        for name, ends in zip(("left", "right"), further, strict=True)
+        if end in ends
+    ]
+    readings = [of_view[end] for of_view in samples.ends]
+    if any(reading.at_border for reading in readings):
+        return 1.0, [*reasons, f"{ordinal} end cut by the image border"]
+    if all(np.isnan(reading.offset_px) for reading in readings):
+        return _NO_END, [*reasons, f"{ordinal} end not seen as an end"]
+    return 1.0, reasons
 
 
 def clarity(chain: Chain, places: Float64) -> float:
