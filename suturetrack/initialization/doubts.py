@@ -97,9 +97,9 @@ def _at_merges(joints: Joints, entries: list[int]) -> list[tuple[int, str, float
             found.append((entry, SHARP, 0.6))
         elif strain > 0:
             found.append((entry, CROSSING, max(1 - _STRAIN * strain, 0.1)))
-        ends = entry, joints.partner[entry]
-        for lead in [joints.lead[e] for e in ends if e in joints.lead][:1]:
-            found.append((entry, SHARED, float(expit(lead / ENERGY))))
+        by_arms = joints.lead.get(entry, joints.lead.get(joints.partner[entry]))
+        if by_arms is not None:
+            found.append((entry, SHARED, float(expit(by_arms / ENERGY))))
         if entry in joints.bent:
             found.append((entry, BENT, _FOREIGN))
     return found
