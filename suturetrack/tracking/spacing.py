@@ -7,6 +7,7 @@ import numpy as np
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import spline
 from suturetrack.nurbs import clamped_knots, evaluate, evenly_spaced
+from suturetrack.polylines import polyline_length
 from suturetrack.tracking.control_points import through
 from suturetrack.types import Float64, Nurbs
 
@@ -57,4 +58,4 @@ def _gaps(curve: Nurbs, rig: StereoRig) -> Float64:
 
 def _length_px(curve: Nurbs, rig: StereoRig) -> float:
     left, right = rig.project(evaluate(curve, np.linspace(0, 1, 4 * len(curve.control_points))))
-    return float(np.linalg.norm(np.diff((left + right) / 2, axis=0), axis=1).sum())
+    return polyline_length((left + right) / 2)
