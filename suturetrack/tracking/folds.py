@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.tracking.sampling import Samples, View, views_at
+from suturetrack.tracking.sampling import Samples, View, leading, views_at
 from suturetrack.types import Bool, Float64, Int64, Nurbs
 
 # A curve lies on a part of itself that is so near and so parallel, and so far away along it; so many
@@ -92,12 +92,7 @@ def _compared(both: tuple[View, View], rows: Int64) -> tuple[Bool, Float64]:
 
 def _doubled(back: Float64, along: Float64) -> tuple[int, bool]:
     """How many of the first samples lie on later ones, `back` px further on, and whether by a fold."""
-    last = -1
-    for j in np.flatnonzero(np.isfinite(back)):
-        if j - last > _STRAY + 1:
-            break
-        last = int(j)
-    count = last + 1
+    count = leading(np.isfinite(back), _STRAY + 1)
     if count == 0 or count >= len(along) // 2 or along[count] <= _SHORTEST_PX:
         return 0, False
-    return count, bool(back[last] < _FOLD_PX)
+    return count, bool(back[count - 1] < _FOLD_PX)

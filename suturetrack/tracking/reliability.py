@@ -11,7 +11,7 @@ from suturetrack.kernels import search
 from suturetrack.nurbs import part
 from suturetrack.tracking.gauss_newton import Fit
 from suturetrack.tracking.images import Images
-from suturetrack.tracking.sampling import View
+from suturetrack.tracking.sampling import View, leading
 from suturetrack.tracking.strands import SAME_STRAND_PX, Neighbours, Strand
 from suturetrack.types import Bool, Float32, Float64, Int64, Nurbs, Status
 
@@ -144,15 +144,7 @@ def _beside(
 
 def loose_ends(wrong: Bool) -> tuple[int, int]:
     """How many of the evenly spaced samples at the start and at the stop are wrong, gaps included."""
-    counts = []
-    for flags in (wrong, wrong[::-1]):
-        last = -1
-        for j in np.flatnonzero(flags):
-            if j - last > _GAP:
-                break
-            last = int(j)
-        counts.append(last + 1)
-    return counts[0], counts[1]
+    return leading(wrong, _GAP), leading(wrong[::-1], _GAP)
 
 
 def judge(evidence: Evidence, unseen_s: float, uncertain_s: float) -> Status:

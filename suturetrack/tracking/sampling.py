@@ -118,6 +118,16 @@ def resampled(flags: Bool, s: Float64) -> Bool:
     return np.interp(s, np.linspace(0, 1, len(flags)), flags) > 0.5
 
 
+def leading(flags: Bool, stride: int) -> int:
+    """How many of the first samples are flagged, gaps between them bridged by steps of up to `stride`."""
+    last = -1
+    for j in np.flatnonzero(flags):
+        if j - last > stride:
+            break
+        last = int(j)
+    return last + 1
+
+
 def greville(knots: Float64) -> Float64:
     """(n + 1,) Greville's parameters, at which the control points of a cubic curve act."""
     return (knots[1:-3] + knots[2:-2] + knots[3:-1]) / spline.DEGREE
