@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from suturetrack.kernels import FAST
 from suturetrack.types import Float32, Image, Int64
 
-_fast = {"fastmath": {"contract", "nnan", "ninf", "nsz", "arcp"}, "error_model": "numpy"}
-# Without licence to mix up +0 and -0.
+# As FAST, without licence to mix up +0 and -0.
 _exact = {"fastmath": {"contract"}, "error_model": "numpy"}
 _sign_bit = np.int32(-(1 << 31))
 _zero, _half, _one, _two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
@@ -38,7 +38,7 @@ def gaussian_taps(sigma: float) -> Float32:
     return np.array([smooth, slope, curve], np.float32)
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def mix_channels(blue: Image, green: Image, red: Image, weights: Float32, plane: Float32) -> None:
     """plane = weights . (blue, green, red), each (H, W)."""
     for y in range(plane.shape[0]):
@@ -56,7 +56,7 @@ def taps_of(sigmas: tuple[float, ...]) -> tuple[Float32, Int64]:
     return np.array([np.pad(t, [(0, 0), (0, largest + 1 - t.shape[1])]) for t in every]), radii
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def ridge_field(
     plane: Float32,
     taps: Float32,
@@ -100,7 +100,7 @@ def ridge_field(
             blur_row(vectors, row - 2, height, kernel, sums, out[row - 2])
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def keep_longer(vectors: Float32, out: Float32) -> None:
     """At every pixel of (H, W, 2) fields, the longer of both vectors into `out`."""
     for y in range(len(out)):
@@ -112,7 +112,7 @@ def keep_longer(vectors: Float32, out: Float32) -> None:
             kept[x, 1] = v if is_longer else q
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def _hessian_row(
     plane: Float32,
     row: int,
@@ -140,7 +140,7 @@ def _hessian_row(
     _first_difference(first, slope, hessian[1])
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def _pad(row: Float32, radius: int, padded: Float32) -> None:
     width = len(row)
     inside = padded[radius:]
@@ -156,7 +156,7 @@ def _pad(row: Float32, radius: int, padded: Float32) -> None:
 # taps at a time, for which `taps` is filled up with zeros.
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def _second_difference(padded: Float32, taps: Float32, out: Float32) -> None:
     radius = len(taps) - 1
     centre = padded[radius:]
@@ -172,7 +172,7 @@ def _second_difference(padded: Float32, taps: Float32, out: Float32) -> None:
             out[x] += near + far
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def _first_difference(padded: Float32, taps: Float32, out: Float32) -> None:
     radius = len(taps) - 1
     for x in range(len(out)):
@@ -185,7 +185,7 @@ def _first_difference(padded: Float32, taps: Float32, out: Float32) -> None:
             out[x] += near + (t2 * (b[x + 2] - a[x + 1]) + t3 * (b[x + 3] - a[x]))
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def _smooth_row(padded: Float32, taps: Float32, out: Float32) -> None:
     radius = len(taps) - 1
     centre = padded[radius:]
@@ -199,7 +199,7 @@ def _smooth_row(padded: Float32, taps: Float32, out: Float32) -> None:
             out[x] += near + (t2 * (a[x + 1] + b[x + 2]) + t3 * (a[x] + b[x + 3]))
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def _smooth_ring(ring: Float32, row: int, taps: Float32, out: Float32) -> None:
     size = len(ring)
     centre = ring[row % size]
@@ -217,7 +217,7 @@ def _smooth_ring(ring: Float32, row: int, taps: Float32, out: Float32) -> None:
             out[x] = out[x] + near + far
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def _vertical_derivatives(
     plane: Float32,
     row: int,
@@ -247,7 +247,7 @@ def _vertical_derivatives(
             line[radius + width + x] = line[radius + width - 1]
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def _ridge_row(
     hessian: Float32,
     shape: tuple[float, float],
@@ -285,7 +285,7 @@ def _ridge_row(
         strength[x] = s2
 
 
-@njit(inline="always", **_fast)
+@njit(inline="always", **FAST)
 def _decay(x: Any) -> Any:
     """exp(-x) for x >= 0, within 2e-7: 2^n by its bits, the rest by a series."""
     exponent = max(x * np.float32(-1 / math.log(2)), np.float32(-126))
@@ -297,7 +297,7 @@ def _decay(x: Any) -> Any:
     return p * np.int32((n + 127) << 23).view(np.float32)
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def blur_row(
     vectors: Float32, row: int, height: int, kernel: Float32, sums: Float32, out: Float32
 ) -> None:
@@ -349,7 +349,7 @@ def _add_tap(a: Any, b: Any, u: Any, v: Any, tap: Any) -> Any:
     return a + signed * u, b + signed * v
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def quantile(values: Float32, share: float) -> float:
     """The value below which `share` of `values` (2-D, not negative) lie, within 0.4 %.
 

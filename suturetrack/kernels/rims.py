@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from suturetrack.kernels import FAST
 from suturetrack.types import Float32
 
-_fast = {"fastmath": {"contract", "nnan", "ninf", "nsz", "arcp"}, "error_model": "numpy"}
 _zero, _half, _one, _two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 
 # Vectors as short as this are not looked at; rows that are asked at once whether any is longer.
@@ -21,7 +21,7 @@ _FAINT, _ROWS = 0.1, 16
 _RIM_FROM, _RIM_TO = 0.55, 0.85
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def fade_rims(plane: Float32, reach: float, field: Float32) -> None:
     """Shortens the vectors of dark ridges that are rims: only one side of them is brighter.
 
@@ -57,7 +57,7 @@ def fade_rims(plane: Float32, reach: float, field: Float32) -> None:
                     field[y, x, 0], field[y, x, 1] = kept * u, kept * v
 
 
-@njit(inline="always", **_fast)
+@njit(inline="always", **FAST)
 def _kept(plane: Any, x: Any, y: Any, u: Any, v: Any, steps: Any) -> Any:
     """The share that is left of a ridge of direction (u, v)."""
     inside = _half * steps[0]
@@ -74,7 +74,7 @@ def _kept(plane: Any, x: Any, y: Any, u: Any, v: Any, steps: Any) -> Any:
     return max(_one - uneven / (np.float32(_RIM_TO - _RIM_FROM) * depth), _zero)
 
 
-@njit(inline="always", **_fast)
+@njit(inline="always", **FAST)
 def _across(plane: Any, x: Any, y: Any, u: Any, v: Any, distance: Any) -> Any:
     """The pixel that is so far from (x, y) across the direction (u, v)."""
     return plane[int(np.rint(y + distance * u)), int(np.rint(x - distance * v))]

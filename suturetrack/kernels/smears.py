@@ -7,15 +7,15 @@ import math
 import numpy as np
 from numba import njit
 
+from suturetrack.kernels import FAST
 from suturetrack.types import Float32, Image
 
-_fast = {"fastmath": {"contract", "nnan", "ninf", "nsz", "arcp"}, "error_model": "numpy"}
 _zero, _half, _one = np.float32(0), np.float32(0.5), np.float32(1)
 # Shares of the longest vector of a smear from which a vector fades and at which it is gone.
 _FADES, _GONE = 1.2, 1.8
 
 
-@njit(cache=True, **_fast)
+@njit(cache=True, **FAST)
 def keep_longer_of_half(half: Float32, mask: Image, longest: float, out: Float32) -> None:
     """Within the mask, the longer of both fields' vectors into `out`.
 
