@@ -85,16 +85,10 @@ def insert_knot(curve: Nurbs, s: float) -> Nurbs:
     return _nurbs(_homogeneous(curve).insert_knot(s))
 
 
-def fit(points: Float64, s: Float64, knots: Float64, degree: int, smoothing: float = 0.0) -> Nurbs:
-    """Least-squares curve through (k, dim) points at (k,) parameters.
-
-    `smoothing` weighs the integral of the squared second derivative over s against the mean squared
-    distance; being an integral it means the same for any knots.
-    """
+def fit(points: Float64, s: Float64, knots: Float64, degree: int) -> Nurbs:
+    """Least-squares curve through (k, dim) points at (k,) parameters."""
     a = basis(s, knots, degree)
     normal: Float64 = a.T @ a / len(a)
-    if smoothing > 0:
-        normal = normal + smoothing * bending_matrix(knots, degree)
     # Spans without data leave the system singular; the tiny ridge picks the smallest solution.
     normal[np.diag_indices_from(normal)] += 1e-12 * np.trace(normal) / len(normal)
     return curve_from(

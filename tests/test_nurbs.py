@@ -124,17 +124,6 @@ def test_a_fit_recovers_the_curve_it_was_sampled_from(curve: Nurbs) -> None:
     assert np.allclose(again.control_points, curve.control_points, atol=1e-5)
 
 
-def test_smoothing_trades_distance_for_bending(curve: Nurbs) -> None:
-    noisy = nurbs.evaluate(curve, S) + np.random.default_rng(0).normal(0, 1, (len(S), 3))
-    bending = nurbs.bending_matrix(curve.knots, curve.degree)
-
-    def energy(c: Nurbs) -> float:
-        return float(np.einsum("id,ij,jd", c.control_points, bending, c.control_points))
-
-    rough, smooth = (nurbs.fit(noisy, S, curve.knots, 3, w) for w in (0.0, 1e-3))
-    assert energy(smooth) < 0.5 * energy(rough)
-
-
 def test_the_bending_matrix_is_the_integral_of_the_squared_second_derivative(curve: Nurbs) -> None:
     fine = np.linspace(0, 1, 20001)
     integral = np.trapezoid((nurbs.derivative(curve, fine, 2) ** 2).sum(1), fine)
