@@ -11,13 +11,6 @@ from suturetrack.types import Float32, Float64, Nurbs
 PlacedDoubts = tuple[tuple[tuple[float, float], ...], tuple[tuple[float, float], ...]]
 """The parameters of a curve where the left and the right view are in doubt, and what each leaves of the
 confidence."""
-
-
-def remaining(doubts: PlacedDoubts) -> float:
-    """What doubts leave of the confidence: those of the view that has the graver ones count."""
-    return min(math.prod(rest for _, rest in view) for view in doubts)
-
-
 _MEANT = 0.3
 """What is left of the confidence where the seed lies on another strand as well: of twelve such starts,
 among 141 in clutter, three were right."""
@@ -92,6 +85,11 @@ class Initialization:
         reasons = (_EITHER, *others) if either else others
         confidence = self.confidence * _MEANT if either else self.confidence / _MEANT
         return replace(self, confidence=confidence, reasons=reasons, is_seed_shared=either)
+
+
+def remaining(doubts: PlacedDoubts) -> float:
+    """What doubts leave of the confidence: those of the view that has the graver ones count."""
+    return min(math.prod(rest for _, rest in view) for view in doubts)
 
 
 def in_words(pixels: Float64, rig: StereoRig, scale: int = 1, *, right: bool = False) -> list[str]:
