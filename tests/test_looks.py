@@ -23,7 +23,8 @@ from suturetrack.polylines import polyline_length
 from suturetrack.tracking import Tracker, TrackingConfig
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.images import Images
-from suturetrack.tracking.recovery import Setup, directed, doubting_ends
+from suturetrack.tracking.overlaps import doubting_ends
+from suturetrack.tracking.recovery import Setup, directed
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.searches import FromSeed
 from suturetrack.tracking.strands import Neighbours, Strand

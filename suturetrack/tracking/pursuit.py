@@ -6,7 +6,8 @@ from dataclasses import replace
 
 from suturetrack.initialization import Initialization
 from suturetrack.tracking.follower import Follower
-from suturetrack.tracking.recovery import Setup, find_again, lies_on, starts_on
+from suturetrack.tracking.overlaps import lies_on
+from suturetrack.tracking.recovery import Setup, find_again, starts_on
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.tracking.sureness import SURE
 from suturetrack.types import RidgeField, Seed, Status, ThreadState

@@ -10,16 +10,13 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.length import has_length, length_error
+from suturetrack.tracking.overlaps import doubting_ends, known_as, lies_on, means_no_other
 from suturetrack.tracking.pursuit import Pursuit
 from suturetrack.tracking.recovery import (
     Setup,
     directed,
-    doubting_ends,
     find_again,
     find_elsewhere,
-    known_as,
-    lies_on,
-    means_no_other,
     starts_on,
 )
 from suturetrack.tracking.strands import Neighbours

@@ -16,8 +16,9 @@ from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import has_length
 from suturetrack.tracking.looks import Look, Outcome
+from suturetrack.tracking.overlaps import doubting_ends
 from suturetrack.tracking.pursuit import Pursuit
-from suturetrack.tracking.recovery import Setup, doubting_ends
+from suturetrack.tracking.recovery import Setup
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.tracking.searches import Again, Closer, FromSeed, Search, lengths
 from suturetrack.tracking.strands import Neighbours
