@@ -11,14 +11,17 @@ from suturetrack.tracking.reliability import ASTRAY, EVENLY, RELIABILITY_SAMPLES
 from suturetrack.tracking.sampling import values_at, views_at
 from suturetrack.types import Bool, Float64, Nurbs
 
-_DRIFT = 0.35
-_DRIFT_AT_REST_PX = 0.2
+# What is not seen may leave the curve by this part of its own motion in a field, and by so much at rest.
+_DRIFT, _DRIFT_AT_REST_PX = 0.35, 0.2
 # How much of its drift is left to what moves as most of the thread does.
 _TOGETHER = 0.2
+# Drift from which a stretch may be anywhere, is surely elsewhere, and is gone where it is outside; and that
+# of what may have moved as a whole.
 _ANYWHERE_PX, _HOPELESS_PX, _GONE_PX, _MOVED_PX = 5.0, 15.0, 8.0, 2.0
 # How far a hidden stretch bulges, of the way along it to what is seen, and what share of the curve has to be
 # seen on both of its sides to hold it.
 _BULGE, _HOLD = 0.15, 0.12
+# What is as near to the border as this is outside the images.
 _BORDER_PX = 10.0
 
 

@@ -16,14 +16,15 @@ _DRAWN_PX = 6.0
 _LEAP_PX, _LONGER_PX, _INSISTS_S = 2.5, 1.5, 5.0
 # An end that is hidden steps off by at least this much before the curve's own.
 _CUT_PX = 3.0
-_SETTLING_S = 0.3
-_HELD_S = 1.5
+# For how long a new watch believes the ends, and for how long an end that steps off is held.
+_SETTLING_S, _HELD_S = 0.3, 1.5
 # A length that has kept within this part for so long is the thread's own.
 _STEADY = 0.015
 _SETTLED_S = 0.7
 # One whose mean of late has kept so near to the mean of long for so long does not change at all: one that is
 # drawn out slowly does.
 _CONSTANT, _CONSTANT_S = 0.002, 1.0
+# How soon it is forgotten that a thread was longer, and that an end has gone on.
 _FORGOTTEN_S = 3.0
 _NS = 1e-9
 
@@ -63,6 +64,7 @@ class EndWatch:
         """Length that the thread would have if every step at its ends were believed, but for those along
         other threads that are known."""
         self.seen = (True, True)
+        """Whether the start and the stop are where they show."""
         self.at_border = False
         """Whether the image's border cuts the thread."""
 

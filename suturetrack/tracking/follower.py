@@ -45,7 +45,9 @@ from suturetrack.types import Bool, Nurbs, RidgeField, Status, ThreadState
 _NS = 1e-9
 # An end that is drawn out further than the first is looked at again in the same field, so often at most.
 _LEAP_PX, _LEAPS = 5.0, 6
+# Share of the samples that is as good as all.
 _ALL = 0.97
+# How long after the last doubt it is certain again where the thread runs.
 _SURE_AFTER_S = 0.08
 # Standard deviation, against its length, from which on the images do not tell where a curve runs.
 _VAGUE = 0.0225

@@ -24,11 +24,13 @@ from suturetrack.tracking.sampling import Samples, View, views
 from suturetrack.tracking.strands import NOBODY, SAME_STRAND_PX, Neighbours, Strand
 from suturetrack.types import Bool, Float32, Float64, Nurbs
 
+# From place to place along the normals.
 _STEP_PX = 0.5
 # Offsets measured closer than this along the thread share their noise: the filter smears it.
 _CORRELATION_PX = 4.0
-_REFINED_PX = 3.0
-_OUTLIER_PX = 1.0
+# Reach of the search, and offset from which a measurement counts less, once rounds have halved both.
+_REFINED_PX, _OUTLIER_PX = 3.0, 1.0
+# How far what a view hides may leave the prediction, in depth as well, as a standard deviation.
 _HIDDEN_DRIFT_PX = 3.0
 # What a measurement is worth where another ridge, or another strand of the thread, draws it aside; and what
 # the prediction is beside another ridge, in depth as well, against its errors around.
@@ -43,6 +45,7 @@ _SETTLED_PX = 0.1
 _FREE_PX = 20.0
 # A first search does not know the thread's direction yet where it has bent.
 _LENIENCY = 0.4
+# A local stretch comes and goes within so small a part of the curve: this is its inverse.
 _EVEN = 150.0
 # A thread that moves so far across itself between two fields is smeared to half its response.
 _SMEARED_PX = 6.5

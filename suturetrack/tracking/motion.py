@@ -15,8 +15,9 @@ from suturetrack.types import Bool, Float64, Nurbs
 _KNOTS = clamped_knots(np.linspace(0, 1, 6)[1:-1], spline.DEGREE)
 _PLACES = np.linspace(0, 1, 40)
 _SAMPLES = Samples.at(_KNOTS, _PLACES)
-_GAIN = 0.9
-_FADING_S = 0.5
+# Share of the way to a measured velocity that each field goes, and how soon one fades that is not seen.
+_GAIN, _FADING_S = 0.9, 0.5
+# A longer time between two fields tells no velocity.
 _LONGEST_STEP_S = 0.25
 # Rows that keep the velocity even along the thread, against those that measure it.
 _STIFFNESS = 1e-3

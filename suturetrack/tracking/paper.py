@@ -28,14 +28,17 @@ from suturetrack.tracking.config import PaperConfig
 from suturetrack.tracking.sampling import Samples, View, views
 from suturetrack.types import Float32, Float64, Nurbs, RidgeField
 
-_DIFFERENCE_PX = 1.0
-_SEARCH_STEP_PX = 1.0
+# Reach of the differences that tell the slope of |V|, and from place to place of active search.
+_DIFFERENCE_PX, _SEARCH_STEP_PX = 1.0, 1.0
 # Samples between the ends of the chord at an end.
 _CHORD = 6
 # What active search finds has to respond so much more than the place where the point is.
 _CLEARER = 0.1
+# How many times as far as outward an end is searched for inward.
 _INWARD = 5.0
+# Share of the trace on the diagonal of eq. (13): along the epipolar lines its rows tell no depth.
 _DAMPING = 1e-3
+# The control point next to that of an end.
 _BESIDE = {0: 1, -1: -2}
 
 

@@ -23,8 +23,8 @@ from suturetrack.tracking.sampling import views
 from suturetrack.tracking.sureness import SURE
 from suturetrack.types import Float64, Nurbs, RidgeField, Seed
 
-_PLACES = 24
-_SEEDS = 2
+# Places of the last curve that are looked at, and those of them from which the thread is looked for.
+_PLACES, _SEEDS = 24, 2
 # How closely its length is met elsewhere.
 _CLOSELY = 0.01
 

@@ -17,13 +17,17 @@ from suturetrack.types import Bool, Float32, Float64, Int64, Nurbs, Status
 
 RELIABILITY_SAMPLES = 64
 EVENLY = np.linspace(0, 1, RELIABILITY_SAMPLES)
+# Residual up to which an image shows the thread where the curve is.
 _NEAR_PX = 1.5
+# Where a thread is looked for beside what is unseen, and beside what lies on another strand, how far from all
+# strands that are known, and its response, against a clear view's.
 _BESIDE_PX, _NOT_OWN_PX = np.arange(-30.0, 30.1, 1.5), 6.0
 _NEXT_PX, _NOT_TAKEN_PX = np.arange(-10.0, 10.1, 1.0), 3.0
 _CLEAR = 0.5
 # Shares of the curve's length: what has to be seen to be tracked, and to be held; what may be astray.
 MOST, SOME, ASTRAY = 0.5, 0.2, 0.05
 _LOST_AFTER_S = 0.2
+# Samples from one that is wrong to the next one of the same end, at most.
 _GAP = 5
 # Share that has to run alone, so that the others, which other ridges draw aside, hardly make it longer.
 _CLEARLY = 0.94
