@@ -87,16 +87,7 @@ class StereoRig:
                 flags=cv2.CALIB_ZERO_DISPARITY,
             )
             rotations, projections = (r1, r2), (p1, p2)
-        if abs(projections[1][1, 3]) > abs(projections[1][0, 3]):
-            raise InputError(
-                f"T {np.ravel(translation).tolist()} must run along x, as cameras stand side by side "
-                "(x right, y down, z forward)"
-            )
-        if projections[1][0, 3] >= 0:
-            raise InputError(
-                "the right camera stands left of the left one (T[0] > 0); "
-                "swap left and right, or give T as right_from_left"
-            )
+        _check_side_by_side(projections[1], translation)
         cameras = [
             Camera(np.asarray(k, float), np.asarray(d, float), r, p, fisheye)
             for (k, d), r, p in zip((left, right), rotations, projections, strict=True)
@@ -289,6 +280,20 @@ def _is_rectified(
         and np.allclose(translation[1:], 0, atol=1e-9 * abs(float(translation[0])))
         and np.allclose(k1[[0, 1, 1], [0, 1, 2]], k2[[0, 1, 1], [0, 1, 2]], rtol=1e-6)
     )
+
+
+def _check_side_by_side(projection: Float64, translation: Float64) -> None:
+    """Raises InputError unless the right view's (3, 4) projection has its camera right of the left one."""
+    if abs(projection[1, 3]) > abs(projection[0, 3]):
+        raise InputError(
+            f"T {np.ravel(translation).tolist()} must run along x, as cameras stand side by side "
+            "(x right, y down, z forward)"
+        )
+    if projection[0, 3] >= 0:
+        raise InputError(
+            "the right camera stands left of the left one (T[0] > 0); "
+            "swap left and right, or give T as right_from_left"
+        )
 
 
 def _project(projection: Float64, points: Float64) -> Float64:
