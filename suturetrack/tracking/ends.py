@@ -53,17 +53,12 @@ class EndStep:
         return self.offset_px * self.pixel
 
 
-def find_end(
-    curve: Nurbs,
-    end: int,
-    images: Images,
-) -> EndStep | None:
+def find_end(curve: Nurbs, end: int, images: Images) -> EndStep | None:
     """Looks for the step of the response at the end `end` (0 or 1), in both images at once.
 
     None where there is no thread near the end.
     """
-    scale = _px_per_s(curve, end, images.rig)
-    x, both, responses = _profiles(curve, end, images, scale)
+    scale, x, both, responses = _profiles(curve, end, images)
     inside = both[0].inside(images.rig.image_size) & both[1].inside(images.rig.image_size)
     if np.count_nonzero(inside) < _SMOOTHED:
         return None
@@ -83,11 +78,7 @@ def find_end(
     return EndStep(boundary, 1 / scale, at_border, widens=widens < boundary)
 
 
-def end_shift(
-    curve: Nurbs,
-    end: int,
-    images: Images,
-) -> tuple[float, Float64] | None:
+def end_shift(curve: Nurbs, end: int, images: Images) -> tuple[float, Float64] | None:
     """By how much further the right view shows the thread at the end `end` (0 or 1) than the left.
 
     It tells the depth of the end where the thread runs along an epipolar line.
@@ -96,8 +87,7 @@ def end_shift(
         The difference in px along the curve, and its (3,) derivative by the place of the end; None
         where the views do not both show the end.
     """
-    scale = _px_per_s(curve, end, images.rig)
-    x, both, responses = _profiles(curve, end, images, scale)
+    scale, x, both, responses = _profiles(curve, end, images)
     tip = int(np.searchsorted(x, 0.0))
     shown, rows = [], []
     for view, response in zip(both, _smooth(np.stack(responses)), strict=True):
@@ -112,19 +102,17 @@ def end_shift(
 
 
 def _profiles(
-    curve: Nurbs,
-    end: int,
-    images: Images,
-    scale: float,
-) -> tuple[Float64, tuple[View, View], list[Float64]]:
-    """(k,) px beyond the end, the curve there in both images, and their (k,) responses."""
+    curve: Nurbs, end: int, images: Images
+) -> tuple[float, Float64, tuple[View, View], list[Float64]]:
+    """Px per unit of s, (k,) px beyond the end, the curve there in both images, and their (k,) responses."""
+    scale = _px_per_s(curve, end, images.rig)
     x = np.arange(-min(_INWARD_PX, 0.5 * scale), _OUTWARD_PX + 0.1, _STEP_PX)
     both = views(images.rig, *_extension(curve, end, np.asarray(x / scale, np.float64)))
     responses = [
         np.minimum(view.responses(image) / level, 1.2)
         for image, view, level in zip(images.both, both, images.levels, strict=True)
     ]
-    return x, both, responses
+    return scale, x, both, responses
 
 
 def _smooth(profiles: Float64) -> Float64:
@@ -133,6 +121,7 @@ def _smooth(profiles: Float64) -> Float64:
 
 
 def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:
+    """Speed of the curve in the images at an end, px per unit of s; at least half of that of the rest."""
     left, right = views_at(rig, curve, _ALONG)
     speed = (left.speed + right.speed) / 2
     at_end = speed[-2:].mean() if end else speed[:2].mean()
