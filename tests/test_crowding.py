@@ -16,7 +16,7 @@ from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.crowding import covered, crowded
 from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import views
-from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
+from suturetrack.tracking.strands import NOBODY, Neighbour, Neighbours, Strand
 from suturetrack.types import Seed, Stamp, Status, StereoFrame
 from tests.painting import FPS, paint
 
@@ -74,7 +74,7 @@ def test_a_known_strand_crowds_the_thread_although_both_are_one_ridge(rig: Stere
     there[:, 1] += 2.0 * 200.0 / rig.focal
     both = views(rig, there, np.gradient(there, axis=0))
     seen = np.ones(len(there), bool)
-    others = Neighbours(((Strand.other(both[0], seen), Strand.other(both[1], seen)),))
+    others = Neighbours((Neighbour(Strand.other(both[0], seen), Strand.other(both[1], seen)),))
     found = flags(images_of(rig, [thread]), thread, others)
     assert found[55:].all()
     assert not found[:45].any()
@@ -86,7 +86,7 @@ def test_a_known_strand_that_the_field_does_not_show_leaves_the_thread_alone(
     thread, other = line((-25, 0), (25, 0)), line((-25, -6), (25, 6))
     both = views(rig, other, np.gradient(other, axis=0))
     strands = tuple(Strand.other(view, np.ones(len(other), bool)) for view in both)
-    known = Neighbours(((strands[0], strands[1]),))
+    known = Neighbours((Neighbour(strands[0], strands[1]),))
     alone, beside = images_of(rig, [thread]), images_of(rig, [thread, other])
     assert known.shown_in(alone).threads == ()
     assert known.shown_in(beside).threads == known.threads
@@ -139,7 +139,7 @@ def test_what_the_views_show_differently_beside_another_thread_tells_no_depth(
     beside = (replace(view, pixels=view.pixels + view.normals) for view in both)
     left, right = (Strand.other(view, np.ones(len(thread), bool)) for view in beside)
     shares = []
-    for others in (NOBODY, Neighbours(((left, right),))):
+    for others in (NOBODY, Neighbours((Neighbour(left, right),))):
         curve = before
         for _ in range(20):
             fit = gauss_newton.fit(curve, curve, images, 5.0, TrackingConfig(), others)

@@ -27,7 +27,7 @@ from suturetrack.tracking.overlaps import doubting_ends
 from suturetrack.tracking.recovery import Setup, directed
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.searches import FromSeed
-from suturetrack.tracking.strands import Neighbours, Strand
+from suturetrack.tracking.strands import Neighbour, Neighbours, Strand
 from suturetrack.tracking.strangers import Strangers
 from suturetrack.tracking.sureness import Sureness
 from suturetrack.types import Bool, Nurbs, RidgeField, Seed, Status, ThreadState
@@ -760,7 +760,7 @@ def test_an_end_that_runs_along_another_thread_leaves_a_look_in_doubt(rig: Stere
     def strands(other: np.ndarray) -> Neighbours:
         both = views(rig, other, np.gradient(other, axis=0))
         left, right = (Strand.other(view, np.ones(len(other), bool)) for view in both)
-        return Neighbours(((left, right),))
+        return Neighbours((Neighbour(left, right),))
 
     def beside(other: np.ndarray) -> Initialization:
         return doubting_ends(found, strands(other), rig)

@@ -13,7 +13,7 @@ from suturetrack.initialization import Initialization, InitializationError, init
 from suturetrack.tracking import Tracker
 from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import views
-from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
+from suturetrack.tracking.strands import NOBODY, Neighbour, Neighbours, Strand
 from suturetrack.tracking.strangers import Strangers
 from suturetrack.types import RidgeField, Seed, Status
 from tests.painting import FPS, curve_through, paint
@@ -79,7 +79,7 @@ def test_another_thread_that_is_held_is_no_stranger(rig: StereoRig) -> None:
     for i, field in enumerate(shown):
         other = line(6.0 * 3 * i / round(SECONDS * FPS))
         left, right = views(rig, other, np.gradient(other, axis=0))
-        others = Neighbours(((Strand.other(left, seen), Strand.other(right, seen)),))
+        others = Neighbours((Neighbour(Strand.other(left, seen), Strand.other(right, seen)),))
         curve = curve_through(line())
         strangers = strangers.step(curve, np.ones(64, bool), Images(field, rig, LEVELS), others)
         assert not strangers.is_found

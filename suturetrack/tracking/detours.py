@@ -12,7 +12,7 @@ from suturetrack.nurbs import curve_from
 from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.reliability import Evidence
 from suturetrack.tracking.sampling import View, distinct, greville, length_of, views_at
-from suturetrack.tracking.strands import Neighbours, Strand
+from suturetrack.tracking.strands import Neighbour, Neighbours, Strand
 from suturetrack.types import Float64, Nurbs
 
 # A crowded stretch is widened by so much of itself and of the curve on either side; what is shorter is no
@@ -80,7 +80,7 @@ def _with_stretch(
     """Other threads, with the stretch of the curve as one of them."""
     left, right = _views(evidence, stretch, rig)
     everywhere = np.ones(_PLACES, bool)
-    mine = Strand.other(left, everywhere), Strand.other(right, everywhere)
+    mine = Neighbour(Strand.other(left, everywhere), Strand.other(right, everywhere))
     return Neighbours((*others.threads, mine))
 
 

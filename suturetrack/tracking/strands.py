@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -66,43 +67,45 @@ _NONE = Strand(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
 
 
 @dataclass(frozen=True, eq=False)
+class Neighbour:
+    """Another thread."""
+
+    left: Strand
+    right: Strand
+    confidence: float = math.inf
+    """How sure it is that it is one."""
+    name: str = ""
+    """Where it is tracked; else empty."""
+
+
+@dataclass(frozen=True, eq=False)
 class Neighbours:
     """Other threads."""
 
-    threads: tuple[tuple[Strand, Strand], ...] = ()
-    """One by one, in the left and in the right image."""
-    confidences: tuple[float, ...] = ()
-    """How sure it is of each that it is one; without them, of all."""
-    names: tuple[str, ...] = ()
-    """Of each that is tracked; empty for others, and without them of all."""
+    threads: tuple[Neighbour, ...] = ()
 
     def as_sure_as(self, confidence: float) -> Neighbours:
         """Those of which it is at least as sure."""
-        if not self.confidences:
-            return self
-        both = zip(self.threads, self.confidences, strict=True)
-        return Neighbours(tuple(thread for thread, sure in both if sure >= confidence))
+        return Neighbours(tuple(t for t in self.threads if t.confidence >= confidence))
 
     @property
     def tracked(self) -> dict[str, Neighbours]:
         """Each that is tracked, alone, by name."""
-        both = zip(self.names, self.threads, strict=False)
-        return {name: Neighbours((thread,)) for name, thread in both if name}
+        return {thread.name: Neighbours((thread,)) for thread in self.threads if thread.name}
 
     @cached_property
     def both(self) -> tuple[Strand, Strand]:
         """All of them, in the left and in the right image."""
         left, right = _NONE, _NONE
         for thread in self.threads:
-            left, right = left.joined(thread[0]), right.joined(thread[1])
+            left, right = left.joined(thread.left), right.joined(thread.right)
         return left, right
 
     def shown_in(self, images: Images) -> Neighbours:
         """Those that are seen in images, which may be made for one thread."""
         both, levels = images.both, images.levels
-        return Neighbours(
-            tuple(thread for thread in self.threads if any(map(_is_shown, thread, both, levels)))
-        )
+        shown = (t for t in self.threads if any(map(_is_shown, (t.left, t.right), both, levels)))
+        return Neighbours(tuple(shown))
 
 
 def _is_shown(strand: Strand, image: Float32, level: float) -> bool:

@@ -17,7 +17,7 @@ from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.looks import Look
 from suturetrack.tracking.recovery import Setup
 from suturetrack.tracking.searches import Again, Closer, FromSeed
-from suturetrack.tracking.strands import Neighbours
+from suturetrack.tracking.strands import Neighbour, Neighbours
 from suturetrack.tracking.thread import Thread, not_found
 from suturetrack.types import RidgeField, Seed, Stamp, ThreadState
 
@@ -177,16 +177,16 @@ class Tracker:
 
     def _others(self, thread: Thread, stamp: Stamp) -> Neighbours:
         """The strands of the other threads that are held."""
-        held = [
-            (
-                other.follower.strands(stamp.capture_ns),
+        held = (
+            Neighbour(
+                *other.follower.strands(stamp.capture_ns),
                 other.confidence,
                 other.name if other.is_tracked else "",
             )
             for other in self._threads.values()
             if other is not thread and other.follower is not None and other.is_held
-        ]
-        return Neighbours(*zip(*held, strict=True))
+        )
+        return Neighbours(tuple(held))
 
     def _drop_look(self, thread: str) -> None:
         if self._look is not None and self._look.thread == thread:
