@@ -11,12 +11,7 @@ from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.matching import Match, match
 from suturetrack.initialization.segments import Ridges, nearest_segment
-from suturetrack.initialization.threads import (
-    Chain,
-    Thread,
-    follow_thread,
-    without_faint_tails,
-)
+from suturetrack.initialization.threads import Chain, Thread, follow_thread, without_faint_tails
 from suturetrack.polylines import coverage, nearest_index, polyline_distances
 from suturetrack.types import Float64, RidgeField
 

@@ -124,11 +124,7 @@ def _hessian_row(
 ) -> None:
     """Second derivatives in one row; `ring` keeps those along u of the rows around it."""
     height, width = plane.shape
-    smooth, slope, curve = (
-        taps[0, : radius + 1],
-        taps[1, : radius + 1],
-        taps[2, : radius + 1],
-    )
+    smooth, slope, curve = taps[0, : radius + 1], taps[1, : radius + 1], taps[2, : radius + 1]
     size = width + 2 * radius
     line, first, second = padded[0, :size], padded[1, :size], padded[2, :size]
     for y in range(row + radius if row else -radius, row + radius + 1):

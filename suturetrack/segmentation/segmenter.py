@@ -14,15 +14,7 @@ from suturetrack.segmentation.config import SegmentationConfig
 from suturetrack.segmentation.sight import SLOTS, Pair, Sight, first_look, learned_look
 from suturetrack.segmentation.smear import Course
 from suturetrack.silhouette import is_cut_out, silhouette_scale, silhouettes
-from suturetrack.types import (
-    Float32,
-    Float64,
-    InputError,
-    RidgeField,
-    Seed,
-    Stamp,
-    StereoFrame,
-)
+from suturetrack.types import Float32, Float64, InputError, RidgeField, Seed, Stamp, StereoFrame
 
 # Share of the way that a learned contrast goes at each step.
 _ADAPT = 0.2

@@ -32,10 +32,7 @@ class Crowd:
 
 
 def crowded(
-    both: tuple[View, View],
-    share: Float64,
-    images: Images,
-    neighbours: Neighbours,
+    both: tuple[View, View], share: Float64, images: Images, neighbours: Neighbours
 ) -> Crowd:
     """Looks beside the samples of a curve.
 

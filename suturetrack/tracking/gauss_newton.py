@@ -87,12 +87,7 @@ class Fit:
 
 
 def search_normals(
-    image: Float32,
-    view: View,
-    share: Float64,
-    level: Float64,
-    reach_px: float,
-    neighbours: Strand,
+    image: Float32, view: View, share: Float64, level: Float64, reach_px: float, neighbours: Strand
 ) -> Offsets:
     """Looks for the thread along the normals of the samples, as one continuous line.
 
@@ -151,10 +146,7 @@ def fit(
 
 
 def observe(
-    curve: Nurbs,
-    images: Images,
-    config: TrackingConfig,
-    neighbours: Neighbours = NOBODY,
+    curve: Nurbs, images: Images, config: TrackingConfig, neighbours: Neighbours = NOBODY
 ) -> Fit:
     """What the field says about a curve that something else has fitted."""
     samples = Samples.of(curve.knots, config.samples_per_span)

@@ -63,10 +63,7 @@ def _without(curve: Nurbs, end: int, samples: int) -> Nurbs:
 
 
 def _grown(
-    curve: Nurbs,
-    end: int,
-    images: Images,
-    fitted: Callable[[Nurbs], Evidence],
+    curve: Nurbs, end: int, images: Images, fitted: Callable[[Nurbs], Evidence]
 ) -> Evidence | None:
     """The curve drawn out along the ridge at an end, and over what crosses it; None if there is none."""
     evidence = None

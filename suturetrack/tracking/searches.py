@@ -12,13 +12,7 @@ from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.length import has_length, length_error
 from suturetrack.tracking.overlaps import doubting_ends, known_as, lies_on, means_no_other
 from suturetrack.tracking.pursuit import Pursuit
-from suturetrack.tracking.recovery import (
-    Setup,
-    directed,
-    find_again,
-    find_elsewhere,
-    starts_on,
-)
+from suturetrack.tracking.recovery import Setup, directed, find_again, find_elsewhere, starts_on
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.types import InputError, Nurbs, RidgeField, Seed
 

@@ -7,11 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import (
-    Initialization,
-    InitializationConfig,
-    InitializationError,
-)
+from suturetrack.initialization import Initialization, InitializationConfig, InitializationError
 from suturetrack.tracking.clock import StreamClock
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.looks import Look
