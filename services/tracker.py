@@ -23,7 +23,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationConfig, InitializationError
 from suturetrack.segmentation import joined
 from suturetrack.tracking import Tracker, TrackerStep, TrackingConfig
-from suturetrack.types import RidgeField, Seed, Stamp, ThreadState
+from suturetrack.types import RidgeField, Seed, Stamp, ThreadState, read_only
 
 # A look in the worker thread must give way to the threads that are held at once.
 _SWITCH_INTERVAL_S = 5e-4
@@ -121,14 +121,11 @@ def warm_up(rig: StereoRig, config: TrackerConfig) -> None:
             cv2.line(view, first, last, direction.tolist(), 3)
         view = cv2.GaussianBlur(view, (0, 0), 1.5)
         view /= 1.001 * np.abs(view).max() + 1e-6
-        # Fields from the wire are read-only, for which kernels are compiled anew.
-        view.flags.writeable = False
-        views.append(view)
+        views.append(read_only(view))
     tracker = Tracker(rig, config.tracking, config.initialization)
     u, v = rig.project_raw(thread[100])[0]
     tracker.seed(Seed(pixel=(float(u), float(v))))
     for frame in range(3):
         tracker.step(RidgeField(Stamp(frame, frame * 33_333_333, 0), views[0], views[1]))
-    nothing = np.zeros_like(views[0])
-    nothing.flags.writeable = False
+    nothing = read_only(np.zeros_like(views[0]))
     tracker.step(joined(Stamp(3, 100_000_000, 0), dict.fromkeys("01", (nothing, nothing))))

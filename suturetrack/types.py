@@ -40,6 +40,15 @@ def check_ranges(config: object, prefix: str, **ranges: tuple[float, float]) -> 
             raise InputError(f"--{prefix}.{option} {given}: use {least:g} to {greatest:g}")
 
 
+def read_only(view: Float32) -> Float32:
+    """The array, to which nobody may write from now on, as to fields from the wire.
+
+    Kernels are compiled apart for arrays that may be written to.
+    """
+    view.flags.writeable = False
+    return view
+
+
 @dataclass(frozen=True, order=True)
 class Stamp:
     """Which frame a value belongs to; given by the source and passed on unchanged by every stage."""

@@ -31,7 +31,7 @@ from suturetrack.initialization.segments import Ridges, find_ridges, nearest_seg
 from suturetrack.initialization.threads import Thread, follow_thread
 from suturetrack.nurbs import curve_from
 from suturetrack.polylines import nearest_index
-from suturetrack.types import Float32, Float64, Nurbs, RidgeField, Seed
+from suturetrack.types import Float64, Nurbs, RidgeField, Seed, read_only
 
 __all__ = [
     "Growth",
@@ -78,10 +78,14 @@ def _initialize_from_afar(
     field: RidgeField, rig: StereoRig, pixel: Float64, config: InitializationConfig, scale: int
 ) -> Initialization:
     """A wide thread is looked at from farther away: all that follows is made for a narrow one."""
-    reduced = RidgeField(field.stamp, _reduced(field.left, scale), _reduced(field.right, scale))
+    left, right = (
+        read_only(np.ascontiguousarray(view[::scale, ::scale]))
+        for view in (field.left, field.right)
+    )
+    reduced = RidgeField(field.stamp, left, right)
     try:
-        left = find_ridges(reduced.left, config)
-        found = _initialize(reduced, left, rig.reduced(scale), pixel / scale, config, scale)
+        ridges = find_ridges(reduced.left, config)
+        found = _initialize(reduced, ridges, rig.reduced(scale), pixel / scale, config, scale)
     except InitializationError as error:
         growth = None if error.growth is None else error.growth.enlarged(scale, field.left.shape)
         candidates = scale * error.candidates
@@ -205,13 +209,6 @@ def _first_curve(pixels: Float64, rig: StereoRig, config: InitializationConfig) 
     s = image_parameters(pixels[:, :2], pixels[:, 2:])
     points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
     return fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
-
-
-def _reduced(view: Float32, scale: int) -> Float32:
-    reduced = np.ascontiguousarray(view[::scale, ::scale])
-    # As fields from the wire are: kernels are compiled apart for arrays that may be written to.
-    reduced.flags.writeable = False
-    return reduced
 
 
 def _trim(pixels: Float64, left: Thread) -> Float64:

@@ -9,7 +9,7 @@ import numpy as np
 from suturetrack.initialization.segments import chain_tangents
 from suturetrack.kernels import matching as kernel
 from suturetrack.kernels import search
-from suturetrack.types import Bool, Float32, Float64
+from suturetrack.types import Bool, Float32, Float64, read_only
 
 _STATE_PX = 1.0
 _PENALTY = 1.6
@@ -98,6 +98,4 @@ def raised(view: Float32, rows: int) -> Float32:
     moved = np.zeros_like(view)
     height = len(view)
     moved[max(-rows, 0) : height - max(rows, 0)] = view[max(rows, 0) : height + min(rows, 0)]
-    # As fields from the wire are: kernels are compiled apart for arrays that may be written to.
-    moved.flags.writeable = False
-    return moved
+    return read_only(moved)

@@ -18,7 +18,7 @@ from suturetrack.initialization.joints import Joints, inward
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
 from suturetrack.polylines import arc_lengths, nearest_index, polyline_distances, resample
-from suturetrack.types import Float32, Float64
+from suturetrack.types import Float32, Float64, read_only
 
 _FAINT = 0.4
 """Strength, against the rest of the thread, below which a last segment is no part of it."""
@@ -86,9 +86,7 @@ class Thread:
         )
         field = whole.copy()
         field[tuple(places[behind < own].T)] = 0
-        # As fields from the wire are: kernels are compiled apart for arrays that may be written to.
-        field.flags.writeable = False
-        return field
+        return read_only(field)
 
     @property
     def pieces(self) -> list[Float64]:

@@ -9,7 +9,7 @@ from suturetrack.initialization import Initialization
 from suturetrack.tracking.pursuit import Pursuit
 from suturetrack.tracking.searches import Found, Search
 from suturetrack.tracking.strands import Neighbours
-from suturetrack.types import Float32, RidgeField, ThreadState
+from suturetrack.types import Float32, RidgeField, ThreadState, read_only
 
 # By when a look should be over, with other threads to be followed at the same time.
 _DELAY_NS = 300_000_000
@@ -96,7 +96,4 @@ class Look:
 
 def _frozen(view: Float32) -> Float32:
     """The view, copied unless nobody may write to it."""
-    if view.flags.writeable:
-        view = view.copy()
-        view.flags.writeable = False
-    return view
+    return read_only(view.copy()) if view.flags.writeable else view
