@@ -44,6 +44,9 @@ def refine(
     Returns:
         The curve, what the images show beside it, (k,) the standard deviations of its samples, and
         how many px lower than the cameras say the right view shows the thread; 0 in doubt.
+
+    Raises:
+        FloatingPointError: the images do not hold the curve, or it runs out of both.
     """
     start = _Fit(curve, np.array([1.0, 100.0]))
     fit = start.improved(views, rig, _DENSE_ROUNDS)
@@ -52,7 +55,7 @@ def refine(
     fit = replace(fit, curve=with_needed_knots(fit.samples(views, rig)))
     fit = fit.improved(views, rig, _FINAL_ROUNDS)
     samples = fit.samples(views, rig)
-    return fit.curve, samples, deviations(fit.curve, samples, fit.stiffness), fit.rows
+    return fit.curve, samples, _deviations(fit.curve, samples, fit.stiffness), fit.rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +83,7 @@ class _Fit:
         return fit
 
 
-def deviations(curve: Nurbs, samples: Samples, stiffness: Float64) -> Float64:
+def _deviations(curve: Nurbs, samples: Samples, stiffness: Float64) -> Float64:
     """(k,) standard deviations of the samples in space, by the noise of the crests.
 
     What the ends tell is not in it: the depth of a thread between them would seem known as well.
@@ -165,8 +168,7 @@ def _crest_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, Float64]:
 
 def _bending_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, Float64]:
     """Bands of the bending across the line of sight and of that in disparity."""
-    first, table = spline.local_basis(samples.s, curve.knots)
-    second = spline.combine(first, table[2], curve.control_points)
+    second = spline.evaluate(samples.s, curve.knots, curve.control_points)[2]
     across, deep = samples.bending_information(second)
     nothing = np.zeros_like(second)
     return (
