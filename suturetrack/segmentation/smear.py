@@ -61,7 +61,10 @@ class Course:
         self._curves.append((capture_ns, points))
 
     def bands(self, now_ns: int, rig: StereoRig) -> tuple[Band, Band] | None:
-        """Where both views should show it; None where it is not known to move."""
+        """Where both views should show it; None where it is not known to move.
+
+        Learns on the way, from bands that were looked at before, what the exposure smears.
+        """
         known = [c for c in self._curves if _YOUNGEST_NS <= now_ns - c[0] <= _OLDEST_NS]
         if len(known) < 2 or now_ns - known[-1][0] > _LATEST_NS:
             return None
