@@ -192,9 +192,7 @@ class StereoRig:
     def project_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """(..., 3) points in the rectified left frame -> (..., 2) pixels of the raw images."""
         left, right = self.project(points)
-        if self.is_rectified:
-            return left, right
-        return _distort(self.left, left), _distort(self.right, right)
+        return self.raw_pixels(left), self.raw_pixels(right, right=True)
 
     def rectify_pixels(self, pixels: Float64, *, right: bool = False) -> Float64:
         """(..., 2) pixels of a raw image -> (..., 2) rectified pixels of the same view."""
