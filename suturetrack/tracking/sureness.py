@@ -163,10 +163,8 @@ class Sureness:
 
     def _is_accused(self, curve: Nurbs) -> bool:
         """Whether it is a curve that was revoked, and has not moved."""
-        if self._accused is None:
-            return False
-        away = np.linalg.norm(self._outline(curve) - self._accused, axis=2)
-        return bool(away.max() < _SAME_PX)
+        accused = self._accused
+        return accused is not None and _farthest(self._outline(curve), accused) < _SAME_PX
 
     def _has_bent(self, curve: Nurbs) -> bool:
         """Whether its left image is no more the one that counted last, moved, turned and enlarged."""
@@ -180,8 +178,7 @@ class Sureness:
 
     def _away(self, found: Nurbs, followed: Nurbs) -> float:
         """How far two curves are apart, px."""
-        apart = self._outline(found) - self._outline(followed)
-        return float(np.linalg.norm(apart, axis=2).max())
+        return _farthest(self._outline(found), self._outline(followed))
 
     def _outline(self, curve: Nurbs) -> Float64:
         """(2, k, 2) px, evenly spaced along the left and along the right image of the curve."""
@@ -201,7 +198,12 @@ def _apart(whole: Float64, part: Float64) -> float:
         for tip, end in ((whole[:reach], part[0]), (whole[: -reach - 1 : -1], part[-1]))
     )
     there = resample(whole[start : len(whole) - stop], _PLACES)
-    return float(np.linalg.norm(there - resample(part, _PLACES), axis=1).max())
+    return _farthest(there, resample(part, _PLACES))
+
+
+def _farthest(one: Float64, other: Float64) -> float:
+    """Distance of those of (..., 2) points that are the farthest apart."""
+    return float(np.linalg.norm(one - other, axis=-1).max())
 
 
 def _lessened(doubts: PlacedDoubts, later: PlacedDoubts) -> PlacedDoubts:
