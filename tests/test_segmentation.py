@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from scipy.special import expit
 
 from suturetrack.camera import StereoRig
-from suturetrack.contrast import GRAY, SIGMAS, contrast_along, contrast_at
 from suturetrack.directions import direction_image, direction_key
 from suturetrack.kernels import ridge, rims
 from suturetrack.segmentation import (
@@ -22,7 +21,8 @@ from suturetrack.segmentation import (
     Segmenter,
     gaussian_kernel,
 )
-from suturetrack.silhouette import is_cut_out
+from suturetrack.segmentation.contrast import GRAY, SIGMAS, contrast_along, contrast_at
+from suturetrack.segmentation.silhouette import is_cut_out
 from suturetrack.stage import Scene, open_scene
 from suturetrack.stage.appearance import Picture
 from suturetrack.types import Float32, Float64, Image, InputError, Seed, Stamp, StereoFrame

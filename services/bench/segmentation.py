@@ -16,8 +16,8 @@ from rich.console import Console
 from scipy.spatial import cKDTree
 
 from services.bench import report
-from suturetrack.contrast import SIGMAS
 from suturetrack.segmentation import SegmentationConfig, Segmenter
+from suturetrack.segmentation.contrast import SIGMAS
 from suturetrack.stage import Picture, Scene, open_scene
 from suturetrack.types import Float64, Image, InputError, Seed, Stamp, StereoFrame
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.contrast import SIGMAS, Contrast, contrast_along, contrast_at
 from suturetrack.kernels import ridge, smears
 from suturetrack.segmentation.config import SegmentationConfig
+from suturetrack.segmentation.contrast import SIGMAS, Contrast, contrast_along, contrast_at
 from suturetrack.segmentation.sight import SLOTS, Pair, Sight, first_look, learned_look
+from suturetrack.segmentation.silhouette import is_cut_out, silhouette_scale, silhouettes
 from suturetrack.segmentation.smear import Course
-from suturetrack.silhouette import is_cut_out, silhouette_scale, silhouettes
 from suturetrack.types import Float32, Float64, InputError, RidgeField, Seed, Stamp, StereoFrame
 
 # Share of the way that a learned contrast goes at each step.

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.contrast import GRAY, SIGMAS, Contrast, channel_means
 from suturetrack.kernels import ridge, rims, smears
 from suturetrack.segmentation.config import SegmentationConfig
+from suturetrack.segmentation.contrast import GRAY, SIGMAS, Contrast, channel_means
 from suturetrack.segmentation.smear import WIDER, Band
 from suturetrack.types import Float32, Float64, Image, StereoFrame
 
