@@ -287,20 +287,20 @@ class Thread:
 
     def _take_again(self, outcome: Outcome, known_lengths: tuple[float, ...]) -> None:
         """A thread that is held still gives way only to a curve that is sure."""
-        assert outcome.pursuit is not None
-        assert outcome.state is not None
-        if outcome.state.curve is None:
+        pursuit, state = outcome.pursuit, outcome.state
+        assert pursuit is not None
+        assert state is not None
+        if state.curve is None:
             return
-        is_sure = outcome.pursuit.found.confidence >= SURE
+        is_sure = pursuit.found.confidence >= SURE
         # Where any length was looked for, nothing else tells that it is the thread.
         has_no_length = self.follower is not None and self._was_sure and not known_lengths
         may_be_unsure = not (self.is_held or has_no_length)
         is_worse = self._state.status is not Status.TRACKING and (is_sure or may_be_unsure)
         # What is followed may have shrunk from what was found.
-        is_whole = has_length(outcome.state.curve, known_lengths)
-        is_whole &= not self._is_stub(outcome.state)
-        if is_worse and is_whole and outcome.state.status is Status.TRACKING:
-            is_same = self._was_followed_for_sure(outcome.state.curve)
+        is_whole = has_length(state.curve, known_lengths) and not self._is_stub(state)
+        if is_worse and is_whole and state.status is Status.TRACKING:
+            is_same = self._was_followed_for_sure(state.curve)
             before = self._sureness if is_same else None
             is_known = self._was_sure and bool(known_lengths)
             self._hold(outcome, "found again", before, is_known=is_known)
@@ -319,12 +319,10 @@ class Thread:
     def _take_closer(self, search: Closer, outcome: Outcome) -> None:
         assert isinstance(outcome.found, Initialization)
         assert self._sureness is not None
-        found = outcome.found
-        if outcome.state is None or outcome.state.status is Status.LOST:
+        found, state = outcome.found, outcome.state
+        if state is None or state.status is Status.LOST or self._is_stub(state):
             return
-        if self._is_stub(outcome.state):
-            return
-        if self._puts_right(found, outcome.state):
+        if self._puts_right(found, state):
             self._hold(outcome, "put right", self._sureness)
             return
         was_sure, may_be_unsure = self._is_sure, bool(search.before) or not self._was_sure
@@ -372,12 +370,12 @@ class Thread:
         if state.status is not Status.TRACKING or not self._may_be_aside:
             return False
         known, curve = self.follower.known_length, self.follower.model.curve
-        has_length = not known.is_another(state.length, known.now, 0.0, is_clear=False)
-        has_length &= not known.is_exceeded(state.length, 0.0)
+        if known.is_another(state.length, known.now, 0.0, is_clear=False):
+            return False
+        if known.is_exceeded(state.length, 0.0):
+            return False
         likely = 0.0 if self.follower.makes_detour else _LIKELY
-        return has_length and self._sureness.outweighs(
-            found.confidence, state.curve, curve, likely=likely
-        )
+        return self._sureness.outweighs(found.confidence, state.curve, curve, likely=likely)
 
     @property
     def _may_be_aside(self) -> bool:
