@@ -440,6 +440,21 @@ def test_an_edge_that_draws_a_bow_straight_is_not_called_tracking(
     assert all(state.status is Status.OCCLUDED for state in taken_for_it)
 
 
+@pytest.mark.parametrize("start_s", [0.0, 0.7, 1.5])
+def test_a_kink_in_depth_that_no_view_shows_is_not_called_tracking(
+    rig: StereoRig, start_s: float
+) -> None:
+    truths = [thread(start_s + i / FPS / 3) for i in range(45)]
+    kink = np.clip(1 - np.abs(np.arange(601) - 300) / 60, 0, 1)[:, None]
+    shows = [points * (1 + 0.03 * kink * (20 <= i < 32)) for i, points in enumerate(truths)]
+    fields = [paint(rig, [points], i) for i, points in enumerate(shows)]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    assert all(state.status is Status.TRACKING for state in states[:20] + states[35:])
+    for state, truth in list(zip(states, truths, strict=True))[20:25]:
+        assert error(state, truth).largest > 4.0
+        assert state.status is Status.OCCLUDED
+
+
 def test_a_hidden_end_is_held_and_taken_up_again(rig: StereoRig) -> None:
     truths = [thread(i / FPS) for i in range(36)]
     fields = []
