@@ -9,7 +9,6 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -23,7 +22,7 @@ from rich.text import Text
 from services.status import RigWatch, nothing_runs, watch_rigs
 from services.tables import new_table
 from services.topics import PROCESSES
-from services.zenoh_transport import load_config, socket_directory
+from services.zenoh_transport import load_config, socket_root
 from suturetrack.types import InputError
 
 OK, WARNING, ERROR = "ok", "warning", "error"
@@ -173,12 +172,10 @@ def _shared_memory() -> Finding:
 
 def _sockets() -> Finding:
     try:
-        base = socket_directory(".doctor")  # no rig can have this name
-        with suppress(OSError):  # another doctor may have been quicker
-            base.rmdir()
+        root = socket_root()
     except InputError as error:
         return Finding(ERROR, "sockets", str(error), "XDG_RUNTIME_DIR names another place")
-    return Finding(OK, "sockets", f"in {base.parent}, this user's alone")
+    return Finding(OK, "sockets", f"in {root}, this user's alone")
 
 
 def _disk(folder: Path) -> Finding:

@@ -59,23 +59,30 @@ def socket_directory(rig: str) -> Path:
     Raises:
         InputError: it cannot be made, or others could reach into it.
     """
-    base = _base()
+    return _private(socket_root() / rig)
+
+
+def socket_root() -> Path:
+    """The directory above those of all rigs; made, and refused, as these."""
+    return _private(_root())
+
+
+def _private(directory: Path) -> Path:
     try:
-        for directory in (base, base / rig):
-            directory.mkdir(mode=0o700, exist_ok=True)
-            found = directory.lstat()
-            if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
-                raise InputError(f"{directory} belongs to somebody else; remove it")
-            if found.st_mode & 0o077:
-                raise InputError(f"others may enter {directory}; run: chmod 700 {directory}")
+        directory.mkdir(mode=0o700, exist_ok=True)
+        found = directory.lstat()
     except OSError as error:
         raise InputError(f"no directory for sockets: {error}") from error
-    return base / rig
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+        raise InputError(f"{directory} belongs to somebody else; remove it")
+    if found.st_mode & 0o077:
+        raise InputError(f"others may enter {directory}; run: chmod 700 {directory}")
+    return directory
 
 
 def local_rigs() -> list[str]:
     """Names of the rigs of which processes of this user listen on this machine."""
-    return sorted({path.parent.name for path in _base().glob("*/*.sock")})
+    return sorted({path.parent.name for path in _root().glob("*/*.sock")})
 
 
 def remove_sockets(rig: str) -> None:
@@ -86,7 +93,7 @@ def remove_sockets(rig: str) -> None:
     directory.rmdir()
 
 
-def _base() -> Path:
+def _root() -> Path:
     runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
     if runtime.is_absolute() and os.access(runtime, os.W_OK):
         return runtime / "suturetrack"
@@ -94,8 +101,11 @@ def _base() -> Path:
 
 
 def local_config(rig: str, process: str) -> zenoh.Config:
-    """The default: peers on this machine only, over Unix sockets and shared memory."""
-    directory = socket_directory(rig)
+    """The default: peers on this machine only, over Unix sockets and shared memory.
+
+    Only who listens makes the directory of the rig, so that asking for one that is not there leaves nothing.
+    """
+    directory = socket_directory(rig) if process in LISTENERS else socket_root() / rig
 
     def endpoint(name: str) -> str:
         path = directory / f"{name}.sock"

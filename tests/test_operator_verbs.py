@@ -1,4 +1,4 @@
-"""`suturetrack seed` and `suturetrack grasp`: what a person reads when it goes wrong."""
+"""`suturetrack seed` and `suturetrack grasp`: what a person reads when it goes wrong, and what is left."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import pytest
 
 from services import cli
 from services.arguments import metres
+from services.zenoh_transport import socket_root
 from suturetrack.types import InputError
 
 
@@ -39,6 +40,7 @@ def test_a_length_without_a_unit_is_refused(text: str) -> None:
         ("grasp", "exactly one of --from-end, --from-start, --fraction and --near"),
         ("grasp --from-end 10mm --fraction 0.5", "exactly one of --from-end, --from-start"),
         ("grasp --from-end 10", "such as 10mm"),
+        ("status --once --rig other", "no process of rig 'other' runs"),
         ("console --port 9999999", "port 9999999: use 1 to 65535, or 0"),
     ],
 )
@@ -54,3 +56,4 @@ def test_bad_calls_get_one_clear_line(
     err = capsys.readouterr().err
     assert err.count("\n") == 1
     assert reason in err
+    assert not list(socket_root().iterdir())
