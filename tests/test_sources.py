@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 
 from services.bus import Bus
@@ -262,6 +264,14 @@ def test_a_loop_goes_there_and_back_in_rising_time(tmp_path: Path, calibration: 
     assert [e.capture_ns for e in exposures if e][-1] == round(4001 * 1e9 / 30)
     with pytest.raises(InputError, match="--loop 7"):
         open_input(InputConfig(**options, loop=7))  # type: ignore[arg-type]
+
+
+def test_a_loop_that_memory_does_not_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    free = SimpleNamespace(available=2 * 40 * 6 * 640 * 480)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
+    open_input(InputConfig("stage:figure8-107", loop=40))
+    with pytest.raises(InputError, match=r"--loop 41: 0\.1 GB of images .*; use 40 or fewer"):
+        open_input(InputConfig("stage:figure8-107", loop=41))
 
 
 def test_a_source_that_ends_before_all_the_frames_that_are_wanted_says_so(

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import psutil
+
 from services.sources.footage import Exposure, Footage
 from suturetrack.types import InputError
+
+_SHARE = 0.5
+"""Of the free memory that the images may fill; who works on them needs some, too."""
 
 
 class LoopFootage:
@@ -15,12 +20,20 @@ class LoopFootage:
     frame_count: int | None = None
 
     def __init__(self, footage: Footage, count: int):
-        """Raises InputError for a camera, or where there are too few frames."""
+        """Raises InputError for a camera, or for more frames than there are or than memory holds."""
         if footage.live:
             raise InputError("--loop needs recorded input; a camera never ends")
         self._footage, self._count = footage, count
         if not 2 <= count <= (footage.frame_count or count):
             raise self._fault(footage.frame_count)
+        width, height = footage.size
+        frame_bytes = 2 * 3 * width * height  # both images, in colour
+        most = int(_SHARE * psutil.virtual_memory().available / frame_bytes)
+        if count > most:
+            raise InputError(
+                f"--loop {count}: {count * frame_bytes / 1e9:.1f} GB of images do not fit into half of the "
+                f"memory that is free; use {most} or fewer"
+            )
         self._exposures: list[Exposure] = []
         self.size, self.fps, self.seeds = footage.size, footage.fps, footage.seeds
 
