@@ -19,7 +19,6 @@ rmw_zenoh, but another hash: messages are told apart by it, yet it is not the on
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import struct
 import threading
@@ -34,7 +33,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
-from services.zenoh_session import Session
+from services.zenoh_session import Session, configured
 from suturetrack.types import InputError
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
@@ -170,7 +169,6 @@ def _dds_name(kind: str) -> str:
 
 
 def _open(router: str) -> Session:
-    config = zenoh.Config()
     settings = {
         "mode": "client",
         "connect/endpoints": [router],
@@ -178,9 +176,7 @@ def _open(router: str) -> Session:
         "scouting/multicast/enabled": False,
     }
     try:
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
-        return Session(config)
+        return Session(configured(settings))
     except zenoh.ZError as error:
         raise InputError(
             f"no ROS 2 graph at {router}; start its router (ros2 run rmw_zenoh_cpp rmw_zenohd), or "

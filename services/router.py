@@ -7,14 +7,20 @@ import signal
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 import zenoh
 
 from services import RUST_LOG
+from services.zenoh_session import configured
 from services.zenoh_transport import endpoints, explain, load_config
 from suturetrack.types import InputError
 
+_OPEN = {
+    "mode": "router",
+    "scouting/multicast/enabled": False,
+    "listen/endpoints": ["tcp/127.0.0.1:7447"],
+}
+"""A router for the programs of this machine."""
 _LONGEST_WAIT_S = 0.25
 
 
@@ -29,22 +35,14 @@ class RouterConfig:
 
 def run(config: RouterConfig) -> None:
     """Runs until SIGINT or SIGTERM; raises InputError."""
-    settings = zenoh.Config() if config.zenoh is None else load_config(config.zenoh)
-    if config.zenoh is None:
-        settings.insert_json5("mode", '"router"')
-        settings.insert_json5("scouting/multicast/enabled", "false")
-        settings.insert_json5("listen/endpoints", '["tcp/127.0.0.1:7447"]')
-    elif json.loads(settings.get_json("mode")) != "router":
+    settings = configured(_OPEN) if config.zenoh is None else load_config(config.zenoh)
+    if json.loads(settings.get_json("mode")) != "router":
         raise InputError(f'zenoh {config.zenoh}: a router needs mode: "router"')
     zenoh.init_log_from_env_or(RUST_LOG)
     stop = threading.Event()
 
-    def handler(number: int, frame: FrameType | None) -> None:
-        del number, frame
-        stop.set()
-
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handler)
+        signal.signal(number, lambda *_: stop.set())
     try:
         with zenoh.open(settings):
             print(f"router: listening on {endpoints(settings, 'listen')}", flush=True)

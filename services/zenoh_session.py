@@ -9,9 +9,10 @@ the program down, so that every session is closed before that, and its threads a
 from __future__ import annotations
 
 import atexit
+import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
 from typing import Any, TypeVar
 
@@ -66,6 +67,14 @@ class Session:
         deadline = time.monotonic() + _LONGEST_CALL_S
         for thread in self._threads - {threading.current_thread()}:
             thread.join(max(0.0, deadline - time.monotonic()))
+
+
+def configured(settings: Mapping[str, Any]) -> zenoh.Config:
+    """Zenoh's defaults but for some settings, by their paths; raises zenoh.ZError."""
+    config = zenoh.Config()
+    for path, value in settings.items():
+        config.insert_json5(path, json.dumps(value))
+    return config
 
 
 def _beside(function: Callable[[], T]) -> T:

@@ -26,7 +26,7 @@ from zenoh.shm import GarbageCollect, ShmProvider, ZShmMut
 
 from services.bus import Deliver, NoAnswer, Reply
 from services.wire import Packet, WireError
-from services.zenoh_session import Session
+from services.zenoh_session import Session, configured
 from suturetrack.types import InputError
 
 LISTENERS = ("source", "segmenter", "tracker", "run")
@@ -131,10 +131,7 @@ def local_config(rig: str, process: str) -> zenoh.Config:
         # Room for hundreds of states, so that none is dropped while a machine is short of time.
         "transport/link/tx/queue/size/interactive_high": 16,
     }
-    config = zenoh.Config()
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
+    return configured(settings)
 
 
 def load_config(path: Path) -> zenoh.Config:
@@ -149,10 +146,7 @@ def load_config(path: Path) -> zenoh.Config:
 
 def sweep_shared_memory() -> None:
     """Removes the shared memory of processes that have ended; Zenoh does so when it opens."""
-    config = zenoh.Config()
-    for key, value in _CLOSED.items():
-        config.insert_json5(key, json.dumps(value))
-    zenoh.open(config).close()  # type: ignore[no-untyped-call]
+    zenoh.open(configured(_CLOSED)).close()  # type: ignore[no-untyped-call]
 
 
 class ZenohTransport:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import socket
 import struct
 import threading
@@ -29,6 +28,7 @@ from services.service import Service, ServiceConfig
 from services.sources import InputConfig, open_input
 from services.sources import ros2 as ros2_source
 from services.sources.ros_image import CAMERA_INFO, IMAGE
+from services.zenoh_session import configured
 from suturetrack import nurbs
 from suturetrack.types import Energies, InputError, Nurbs, Stamp, Status, ThreadState
 from tests.conftest import wait_until
@@ -48,12 +48,8 @@ KINDS = {
 
 
 def session(mode: str, **endpoints: str) -> zenoh.Session:
-    config = zenoh.Config()
-    config.insert_json5("mode", json.dumps(mode))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    for name, endpoint in endpoints.items():
-        config.insert_json5(f"{name}/endpoints", json.dumps([endpoint]))
-    return zenoh.open(config)
+    places = {f"{side}/endpoints": [endpoint] for side, endpoint in endpoints.items()}
+    return zenoh.open(configured({"mode": mode, "scouting/multicast/enabled": False, **places}))
 
 
 @pytest.fixture(scope="module")
