@@ -95,14 +95,12 @@ def _read(paths: tuple[Path, Path], calibration: Path, rig: StereoRig) -> tuple[
 def _describe(rig: StereoRig, unit: str | None, console: Console) -> None:
     table = new_table("calibration", "", "")
     table.show_header = False
-    scale = rig.metres_per_unit * 1000
-    name = "m" if rig.metres_per_unit == 1 else "mm"
     rotation, _ = rig.right_from_left
     turn = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
     horizontal, vertical = field_of_view(rig)
     table.add_row("image", f"{rig.image_size[0]}x{rig.image_size[1]} px")
-    table.add_row("unit", f"{name} ({'given' if unit else 'guessed from the baseline'})")
-    table.add_row("baseline", f"{rig.baseline * scale:.3f} mm")
+    table.add_row("unit", f"{rig.unit} ({'given' if unit else 'guessed from the baseline'})")
+    table.add_row("baseline", f"{rig.baseline * rig.mm_per_unit:.3f} mm")
     table.add_row("angle between the cameras", f"{turn:.2f} deg")
     for side, camera in (("left", rig.left), ("right", rig.right)):
         k = camera.matrix
@@ -142,7 +140,7 @@ def _rows(found: Epipolar | None, rig: StereoRig, console: Console) -> None:
     table.add_row("vertical error, 95 %", f"{found.p95_px:.2f} px")
     table.add_row("vertical shift (left - right)", f"{found.shift_px:+.2f} px")
     if np.isfinite(found.distance):
-        distance_mm = found.distance * rig.metres_per_unit * 1000
+        distance_mm = found.distance * rig.mm_per_unit
         table.add_row("distance of the features, median", f"{distance_mm:.4g} mm")
     console.print(table)
 
@@ -176,7 +174,7 @@ def _judge(found: Epipolar | None, rig: StereoRig) -> tuple[str | None, list[str
             "the matched features have no disparity: they are dirt or compression, or far away; take "
             "images of a near scene with more texture"
         )
-    distance_mm = found.distance * rig.metres_per_unit * 1000
+    distance_mm = found.distance * rig.mm_per_unit
     if np.isfinite(distance_mm) and not 5 <= distance_mm <= 5000:
         doubtful.append(f"the scene seems {distance_mm:.3g} mm away; is the unit right? (--unit)")
     return None, doubtful

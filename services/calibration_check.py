@@ -129,9 +129,9 @@ def pixel_convention(rig: StereoRig) -> str:
 def doubts(rig: StereoRig) -> list[str]:
     """What looks wrong in a calibration, each in one line."""
     found = []
-    baseline_mm = rig.baseline * rig.metres_per_unit * 1000
+    baseline_mm = rig.baseline * rig.mm_per_unit
     if not 1 <= baseline_mm <= 500:
-        other = "mm" if rig.metres_per_unit == 1 else "m"
+        other = "mm" if rig.unit == "m" else "m"
         found.append(
             f"a baseline of {baseline_mm:.6g} mm is unusual; is the unit {other}? (--unit)"
         )

@@ -186,7 +186,7 @@ def _distances(run: str, one: Course, other: Course, rig: StereoRig) -> Distance
         held = Status.LOST not in (a.status, b.status)
         mm.append(_distance(a.curve, b.curve) if held else float("nan"))
         equal += a.status == b.status and _equal(a.curve, b.curve)
-    return Distances(run, one.thread, frames, np.array(mm) * rig.metres_per_unit * 1000, equal)
+    return Distances(run, one.thread, frames, np.array(mm) * rig.mm_per_unit, equal)
 
 
 def _distance(a: Nurbs | None, b: Nurbs | None) -> float:

@@ -79,7 +79,7 @@ def _course(
     truth = [truths.get((thread, s.stamp.frame)) for s in states]
     error = np.array([_error(r, t) for r, t in zip(recorded, truth, strict=True)])
     depth = np.array([np.nan if t is None else np.median(t.points[:, 2]) for t in truth])
-    mm_per_unit = rig.metres_per_unit * 1000
+    mm_per_unit = rig.mm_per_unit
     return Course(
         thread=thread,
         states=recorded,

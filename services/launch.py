@@ -118,10 +118,9 @@ def run(config: RunConfig | DemoConfig) -> None:
 
 
 def _rig_line(rig: StereoRig) -> str:
-    unit = "m" if rig.metres_per_unit == 1 else "mm"
     width, height = rig.image_size
-    baseline_mm = rig.baseline * rig.metres_per_unit * 1000
-    return f"Rig: {width}x{height} px, baseline {baseline_mm:.2f} mm, calibrated in {unit}"
+    baseline_mm = rig.baseline * rig.mm_per_unit
+    return f"Rig: {width}x{height} px, baseline {baseline_mm:.2f} mm, calibrated in {rig.unit}"
 
 
 def _resolve(config: RunConfig, rig_name: str) -> tuple[RunConfig, StereoRig]:

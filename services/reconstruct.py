@@ -86,7 +86,7 @@ def run(config: ReconstructConfig) -> None:
     with opened(config.output) as file:
         file.write(json.dumps(record(found), indent=1, allow_nan=False) + "\n")
     if config.output is not None and config.output.is_file():
-        length_mm = 1000 * rig.metres_per_unit * nurbs.length(found.curve)
+        length_mm = nurbs.length(found.curve) * rig.mm_per_unit
         words = f"{length_mm:.1f} mm long, confidence {found.confidence:.2f}"
         print(f"Curve in {config.output}: {'; '.join([words, *found.reasons])}")
 

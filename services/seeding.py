@@ -192,7 +192,7 @@ class SeedDesk:
 
     def _outcome(self, found: Initialization, most: int | None = None) -> str:
         """In words, with so many reasons at most."""
-        length_mm = nurbs.length(found.curve) * self._rig.metres_per_unit * 1000
+        length_mm = nurbs.length(found.curve) * self._rig.mm_per_unit
         outcome = f"found {length_mm:.1f} mm with confidence {found.confidence:.2f}"
         said = found.reasons[:most]
         unsaid = len(found.reasons) - len(said)

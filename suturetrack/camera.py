@@ -111,6 +111,16 @@ class StereoRig:
         return replace(self, image_size=(width, height), left=left, right=right)
 
     @property
+    def unit(self) -> str:
+        """Name of the calibration's unit: m or mm."""
+        return "m" if self.metres_per_unit == 1 else "mm"
+
+    @property
+    def mm_per_unit(self) -> float:
+        """Length of the calibration's unit, mm."""
+        return 1000 * self.metres_per_unit
+
+    @property
     def right_from_left(self) -> tuple[Float64, Float64]:
         """R and T between the cameras' own axes, as OpenCV has them; T in the calibration's unit."""
         rotation = self.right.rectification.T @ self.left.rectification

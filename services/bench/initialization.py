@@ -102,7 +102,7 @@ def _scene(name: str, seed: int, config: InitializationBench) -> Row:
     truth = next(t for t in scene.truth(0) if t.thread == thread)
     frame = StereoFrame(Stamp(0, 0, 0), *scene.render(0))
     start = Seed(thread, pixel=scene.seed_pixel(0, thread))
-    unit = 1000 * scene.rig.metres_per_unit
+    unit = scene.rig.mm_per_unit
     return _row(f"{name}, {config.rig}", seed, frame, scene.rig, start, truth.points, unit, {})
 
 

@@ -259,7 +259,7 @@ def score(
         limit: the physical limit, calibration's unit.
         milliseconds: time of the update.
     """
-    mm = 1000 * rig.metres_per_unit
+    mm = rig.mm_per_unit
     blank = FrameScore(
         status=state.status,
         energy=state.energies.image_left,

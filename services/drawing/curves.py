@@ -175,7 +175,7 @@ def _motion(
         along = (velocity * slope).sum(axis=1) / (slope * slope).sum(axis=1)
         velocity -= along[:, None] * slope
         ahead = velocity * _AHEAD_S
-        mm = np.linalg.norm(velocity, axis=1) * rig.metres_per_unit * 1000
+        mm = np.linalg.norm(velocity, axis=1) * rig.mm_per_unit
         speed = [float(mm.mean()), float(mm.max())]
     motion = row(rr.Arrows3D, origins=arrows[: len(ahead)], vectors=ahead)
     yield f"/rig/thread/{part(state.thread)}/velocity", motion
@@ -185,7 +185,7 @@ def _motion(
 def _plots(state: ThreadState, rig: StereoRig) -> Iterator[Entry]:
     root, energies = f"/plots/{part(state.thread)}", state.energies
     image = [energies.image_left, energies.image_right]
-    length_mm = state.length * rig.metres_per_unit * 1000
+    length_mm = state.length * rig.mm_per_unit
     count = 0 if state.curve is None else len(state.curve.control_points)
     yield f"{root}/energy/image", row(rr.Scalars, scalars=image)
     yield f"{root}/energy/end", row(rr.Scalars, scalars=energies.end)
