@@ -20,7 +20,7 @@ from services.calibration_check import (
     pixel_convention,
     thread_is_swapped,
 )
-from services.sources.footage import read_image
+from services.sources.footage import read_image, size_of
 from services.sources.rig import check_size, open_rig
 from services.tables import new_table, report_console
 from suturetrack.camera import StereoRig
@@ -87,8 +87,7 @@ def run(config: CalibrationConfig) -> None:
 def _read(paths: tuple[Path, Path], calibration: Path, rig: StereoRig) -> tuple[Image, Image]:
     left, right = (read_image(path) for path in paths)
     for path, image in zip(paths, (left, right), strict=True):
-        size = image.shape[1], image.shape[0]
-        check_size(size, rig, f"image {path}", f"calibration {calibration}")
+        check_size(size_of(image), rig, f"image {path}", f"calibration {calibration}")
     return left, right
 
 

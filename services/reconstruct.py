@@ -12,7 +12,7 @@ import tyro
 
 from services.output import opened
 from services.sources.exposure import exposure_fault
-from services.sources.footage import check_pair, halves, read_image
+from services.sources.footage import check_pair, halves, read_image, size_of
 from services.sources.rig import check_size, open_rig
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
@@ -132,7 +132,7 @@ def _load(config: ReconstructConfig) -> tuple[Image, Image]:
 
 def _check(left: Image, right: Image, rig: StereoRig) -> None:
     check_pair(left, right, "the images")
-    check_size((left.shape[1], left.shape[0]), rig, "the images", "the calibration")
+    check_size(size_of(left), rig, "the images", "the calibration")
     for name, image in (("left", left), ("right", right)):
         fault = exposure_fault(image)
         if fault:

@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
-from services.sources.footage import Exposure, check_pair
+from services.sources.footage import Exposure, check_pair, size_of
 from services.sources.pairing import (
     Pair,
     Pairing,
@@ -86,7 +86,7 @@ class BagFootage:
             self._reader.close()
             raise
         self._first: Exposure | None = first
-        self.size = first.left.shape[1], first.left.shape[0]
+        self.size = size_of(first.left)
 
     def rig(self, unit: str | None) -> StereoRig:
         """The rig of the camera_info topics beside the images; raises InputError."""

@@ -7,7 +7,7 @@ import time
 
 import cv2
 
-from services.sources.footage import Exposure, Stalled, check_pair, halves
+from services.sources.footage import Exposure, Stalled, check_pair, halves, size_of
 from services.sources.live import STALL_S, Newest
 from suturetrack.types import Image, InputError
 
@@ -59,8 +59,7 @@ class CameraFootage:
         except Stalled as stall:
             self.close()
             raise InputError(f"{stall}; is it connected, and free?") from stall
-        height, width = self._first.left.shape[:2]
-        self.size = width, height
+        self.size = size_of(self._first.left)
 
     def read(self, index: int) -> Exposure:
         """See `Footage`."""
@@ -68,8 +67,8 @@ class CameraFootage:
             return self._first
         self._first = None
         exposure = self._newest.get(STALL_S, self._complaint)
-        height, width = exposure.left.shape[:2]
-        if (width, height) != self.size:
+        width, height = size = size_of(exposure.left)
+        if size != self.size:
             raise InputError(f"{self._where}: images are {width}x{height} now, were {self.size}")
         return exposure
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from services.sources.footage import Exposure, check_pair, read_image
+from services.sources.footage import Exposure, check_pair, read_image, size_of
 from suturetrack.types import InputError
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -21,8 +21,7 @@ class FolderFootage:
         self.fps = fps
         self._pairs = _pairs(folder)
         self.frame_count: int | None = len(self._pairs)
-        left = read_image(self._pairs[0][0])
-        self.size = left.shape[1], left.shape[0]
+        self.size = size_of(read_image(self._pairs[0][0]))
 
     def read(self, index: int) -> Exposure | None:
         """See `Footage`."""
@@ -31,7 +30,7 @@ class FolderFootage:
         paths = self._pairs[index]
         left, right = (read_image(path) for path in paths)
         check_pair(left, right, f"images {paths[0]} and {paths[1]}")
-        width, height = left.shape[1], left.shape[0]
+        width, height = size_of(left)
         if (width, height) != self.size:
             raise InputError(
                 f"image {paths[0]} is {width}x{height}, the first one was "

@@ -80,6 +80,11 @@ def read_image(path: Path) -> Image:
     return np.ascontiguousarray(image[..., :3]) if image.ndim == 3 else image
 
 
+def size_of(image: Image) -> tuple[int, int]:
+    """(width, height) of an image, px."""
+    return image.shape[1], image.shape[0]
+
+
 def check_pair(left: Image, right: Image, where: str) -> None:
     """Raises InputError when two images cannot be the views of one frame."""
     if left.shape != right.shape:
@@ -90,7 +95,8 @@ def check_pair(left: Image, right: Image, where: str) -> None:
 
 
 def _spell(image: Image) -> str:
-    return f"{image.shape[1]}x{image.shape[0]} {'gray' if image.ndim == 2 else 'in colour'}"
+    width, height = size_of(image)
+    return f"{width}x{height} {'gray' if image.ndim == 2 else 'in colour'}"
 
 
 def halves(image: Image, name: str) -> tuple[Image, Image]:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 from services.ros2_graph import RosConfig, RosNode
-from services.sources.footage import Exposure, Stalled, check_pair
+from services.sources.footage import Exposure, Stalled, check_pair, size_of
 from services.sources.live import STALL_S, Newest
 from services.sources.pairing import Pairing, camera_info_topic, is_rectified_topic, rate_of
 from services.sources.ros_image import (
@@ -70,7 +70,7 @@ class Ros2Footage:
         except InputError:
             self.close()
             raise
-        self.size = self._first.left.shape[1], self._first.left.shape[0]
+        self.size = size_of(self._first.left)
 
     def rig(self, unit: str | None) -> StereoRig:
         """The rig of the camera_info topics beside the images; raises InputError."""
@@ -85,7 +85,7 @@ class Ros2Footage:
             return self._first
         self._first = None
         exposure = self._newest.get(STALL_S, self._complaint())
-        if (exposure.left.shape[1], exposure.left.shape[0]) != self.size:
+        if size_of(exposure.left) != self.size:
             raise InputError(f"{self._where}: images are {exposure.left.shape}, were {self.size}")
         return exposure
 

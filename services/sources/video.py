@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 
-from services.sources.footage import Exposure, check_pair, halves
+from services.sources.footage import Exposure, check_pair, halves, size_of
 from suturetrack.types import Image, InputError
 
 
@@ -33,8 +33,7 @@ class VideoFootage:
         self._first: Exposure | None = self._decode(0)
         if self._first is None:
             raise InputError(f"source {paths[0]}: no frame can be decoded")
-        height, width = self._first.left.shape[:2]
-        self.size = width, height
+        self.size = size_of(self._first.left)
 
     def read(self, index: int) -> Exposure | None:
         """See `Footage`."""
