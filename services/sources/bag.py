@@ -81,12 +81,11 @@ class BagFootage:
             self.rectified = is_rectified_topic(self.topics[0])
             self._rest = self._pairs()
             self._next = 0
-            first = self._decode(next(self._rest))
+            self._first = self._decode(next(self._rest))
         except BaseException:
             self._reader.close()
             raise
-        self._first: Exposure | None = first
-        self.size = size_of(first.left)
+        self.size = size_of(self._first.left)
 
     def rig(self, unit: str | None) -> StereoRig:
         """The rig of the camera_info topics beside the images; raises InputError."""
@@ -105,9 +104,8 @@ class BagFootage:
 
     def read(self, index: int) -> Exposure | None:
         """See `Footage`."""
-        if index == 0 and self._first is not None:
+        if index == 0:
             return self._first
-        self._first = None
         pair = next(itertools.islice(self._rest, index - self._next - 1, None), None)
         self._next = index
         return None if pair is None else self._decode(pair)

@@ -55,7 +55,7 @@ class CameraFootage:
         self._thread = threading.Thread(target=self._take, args=(captures,), daemon=True)
         self._thread.start()
         try:
-            self._first: Exposure | None = self._newest.get(_FIRST_S, self._complaint)
+            self._first = self._newest.get(_FIRST_S, self._complaint)
         except Stalled as stall:
             self.close()
             raise InputError(f"{stall}; is it connected, and free?") from stall
@@ -63,9 +63,8 @@ class CameraFootage:
 
     def read(self, index: int) -> Exposure:
         """See `Footage`."""
-        if index == 0 and self._first is not None:
+        if index == 0:
             return self._first
-        self._first = None
         exposure = self._newest.get(STALL_S, self._complaint)
         width, height = size = size_of(exposure.left)
         if size != self.size:

@@ -60,7 +60,7 @@ class Ros2Footage:
         self._node = RosNode("suturetrack_source", ros)
         try:
             self._subscribe(wants_rig=wants_rig)
-            self._first: Exposure | None = self._newest.get(_FIRST_S, self._where)
+            self._first = self._newest.get(_FIRST_S, self._where)
             self.fps = rate_of(self._next_stamps(self._first), fps)
         except Stalled as stall:
             self.close()
@@ -81,9 +81,8 @@ class Ros2Footage:
 
     def read(self, index: int) -> Exposure:
         """See `Footage`."""
-        if index == 0 and self._first is not None:
+        if index == 0:
             return self._first
-        self._first = None
         exposure = self._newest.get(STALL_S, self._complaint())
         if size_of(exposure.left) != self.size:
             raise InputError(f"{self._where}: images are {exposure.left.shape}, were {self.size}")

@@ -30,16 +30,15 @@ class VideoFootage:
         counts = [int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) for capture in self._captures]
         self.frame_count: int | None = min(counts) if min(counts) > 0 else None
         self._next = 0
-        self._first: Exposure | None = self._decode(0)
-        if self._first is None:
+        first = self._decode(0)
+        if first is None:
             raise InputError(f"source {paths[0]}: no frame can be decoded")
-        self.size = size_of(self._first.left)
+        self._first, self.size = first, size_of(first.left)
 
     def read(self, index: int) -> Exposure | None:
         """See `Footage`."""
-        if index == 0 and self._first is not None:
+        if index == 0:
             return self._first
-        self._first = None
         while self._next < index:
             if not self._grab():
                 return None
