@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,12 +20,12 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from services.arguments import arguments_of, write_config
+from services.arguments import arguments_of
 from services.bus import Bus
 from services.checks import check_rig
 from services.fleet import Fleet, Launch
 from services.monitor import Monitor
-from services.output import command
+from services.output import begin_run, command, fresh_folder
 from services.service import ServiceConfig, SharedConfig
 from services.sources import InputConfig, open_input
 from services.zenoh_transport import (
@@ -37,7 +36,6 @@ from services.zenoh_transport import (
     socket_directory,
     sweep_shared_memory,
 )
-from suturetrack.calibration import save_calibration
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationConfig
 from suturetrack.segmentation import SegmentationConfig
@@ -103,7 +101,8 @@ def run(config: RunConfig | DemoConfig) -> None:
     with ExitStack() as stack:
         rig_name = stack.enter_context(_reserved(config.service))
         config, rig = _resolve(config, rig_name)
-        _make_run_folder(config, rig)
+        assert config.service.run_dir is not None
+        begin_run(config.service.run_dir, config, rig, config.input.calibration)
         console.print(_rig_line(rig))
         console.print(f"Recording to {config.service.run_dir}", markup=False, soft_wrap=True)
         if not config.seed:
@@ -134,32 +133,11 @@ def _resolve(config: RunConfig, rig_name: str) -> tuple[RunConfig, StereoRig]:
     seeds = config.seed or footage.seeds
     for pixel in seeds:
         rig.locate(Seed(pixel=pixel))
-    run_dir = config.service.run_dir or _fresh_folder(config.input.source)
+    name = Path(config.input.source.split(",")[0].rpartition(":")[2]).stem or "run"
+    run_dir = config.service.run_dir or fresh_folder(name)
     shared = replace(config.service, rig=rig_name, run_dir=run_dir.absolute())
     service = ServiceConfig(**vars(shared), parent=os.getpid())
     return replace(config, seed=seeds, service=service), rig
-
-
-def _fresh_folder(source: str) -> Path:
-    name = Path(source.split(",")[0].rpartition(":")[2]).stem or "run"
-    return Path("recordings") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
-
-
-def _make_run_folder(config: RunConfig, rig: StereoRig) -> None:
-    folder = config.service.run_dir
-    assert folder is not None
-    if folder.is_dir() and any(folder.glob("*.rrd")):
-        raise InputError(f"run folder {folder} holds a run already; give another --run-dir")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_config(config, folder / "config.toml")
-        given = config.input.calibration
-        if given is not None and given.is_file():
-            shutil.copyfile(given, folder / "calibration.yaml")
-        else:
-            save_calibration(folder / "calibration.yaml", rig)
-    except OSError as error:
-        raise InputError(f"run folder {folder}: {error.strerror}") from error
 
 
 @contextmanager

@@ -1,15 +1,20 @@
-"""Where a verb writes what it was asked for, and what to type next."""
+"""Where a verb writes what it was asked for: a file, or the folder of a run; and what to type next."""
 
 from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
+from services.arguments import write_config
+from suturetrack.calibration import save_calibration
+from suturetrack.camera import StereoRig
 from suturetrack.types import InputError
 
 
@@ -56,3 +61,32 @@ def _whole(output: Path) -> Iterator[TextIO]:
 
 def _straight(output: Path) -> TextIO:
     return output.open("w", newline="", encoding="utf-8")
+
+
+def fresh_folder(name: str) -> Path:
+    """A run's folder, named after now and what is recorded."""
+    return Path("recordings") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
+
+
+def check_holds_no_run(folder: Path) -> None:
+    """Raises InputError for a folder that another run was recorded to."""
+    if folder.is_dir() and any(folder.glob("*.rrd")):
+        raise InputError(f"run folder {folder} holds a run already; give another --run-dir")
+
+
+def begin_run(folder: Path, config: Any, rig: StereoRig, calibration: Path | None = None) -> None:
+    """Makes a run's folder, with its parameters and its calibration: a copy of the file, if it is one.
+
+    Raises:
+        InputError: it holds a run already, or cannot be written to.
+    """
+    check_holds_no_run(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_config(config, folder / "config.toml")
+        if calibration is not None and calibration.is_file():
+            shutil.copyfile(calibration, folder / "calibration.yaml")
+        else:
+            save_calibration(folder / "calibration.yaml", rig)
+    except OSError as error:
+        raise InputError(f"run folder {folder}: {error.strerror}") from error

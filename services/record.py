@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from services.live import PUBLISHERS, LiveView
-from services.output import command
+from services.output import check_holds_no_run, command, fresh_folder
 from services.recording import Recorder
 from services.service import Service, ServiceConfig
 from suturetrack.calibration import save_calibration
@@ -27,9 +25,8 @@ class RecordConfig:
 
 def run(service: Service, config: RecordConfig) -> None:
     """Records until stopped; raises InputError when the folder cannot be used, or not any more."""
-    folder = config.service.run_dir or fresh_folder()
-    if folder.is_dir() and any(folder.glob("*.rrd")):
-        raise InputError(f"run folder {folder} holds a run already; give another --run-dir")
+    folder = config.service.run_dir or fresh_folder("live")
+    check_holds_no_run(folder)
     rig = service.calibrated_rig()
     with ExitStack() as stack:
         level = config.service.recording
@@ -46,8 +43,3 @@ def run(service: Service, config: RecordConfig) -> None:
             if any(recorder.fault for recorder in recorders):
                 raise InputError(service.warning)
     print(f"Open it with: {command('view', folder)}")
-
-
-def fresh_folder() -> Path:
-    """A folder named after now."""
-    return Path("recordings") / f"{time.strftime('%Y%m%d-%H%M%S')}-live"

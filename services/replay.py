@@ -19,18 +19,16 @@ import tyro
 from rich.progress import track
 
 from services import segmenter, topics, tracker
-from services.arguments import write_config
 from services.bus import Bus, NoAnswer
 from services.memory_transport import Hub
 from services.messages import Forget
-from services.output import command
+from services.output import begin_run, command
 from services.recording import Recorder
 from services.run_folder import RunFolder
 from services.segmenter import SegmenterConfig
 from services.service import Service, ServiceConfig, Stopped
 from services.tracker import TrackerConfig
 from services.writer import Request
-from suturetrack.calibration import save_calibration
 from suturetrack.initialization import InitializationConfig
 from suturetrack.segmentation import SegmentationConfig
 from suturetrack.tracking import TrackingConfig
@@ -83,25 +81,17 @@ def run(config: ReplayConfig) -> None:
         print(f"replay: {problem}", file=sys.stderr)
     parameters = changed(_recorded_parameters(config.run), config.set)
     new = config.run_dir or _beside(config.run)
-    if new.is_dir() and any(new.glob("*.rrd")):
-        raise InputError(f"run folder {new} holds a run already; give another --run-dir")
     level = next((about["level"] for about in folder.about().values()), None)
     if level is None:
         raise InputError(f"{config.run}: no recording tells at which level it was made")
     if config.from_ == "tracker" and level != "full":
         raise InputError(f"{config.run}: recorded {level}; --from tracker needs full")
     _check_material(folder, config)
+    begin_run(new, parameters, folder.rig())
     if level != "full":
         print(
             f"{config.run} was recorded {level}: its frames are JPEG, results may differ a little"
         )
-    rig = folder.rig()
-    try:
-        new.mkdir(parents=True, exist_ok=True)
-        write_config(parameters, new / "config.toml")
-        save_calibration(new / "calibration.yaml", rig)
-    except OSError as error:
-        raise InputError(f"run folder {new}: {error.strerror}") from error
     service = ServiceConfig(run_dir=new, recording=config.recording, lockstep=True)
     _replay(folder, parameters, service, config.from_)
     print(f"Replayed to {new}; compare: {command('compare', config.run, new)}")

@@ -11,7 +11,8 @@ from collections import deque
 from pathlib import Path
 
 from services.arguments import arguments_of
-from services.record import RecordConfig, fresh_folder
+from services.output import fresh_folder
+from services.record import RecordConfig
 from services.service import ServiceConfig
 from suturetrack.types import InputError
 
@@ -47,7 +48,7 @@ class Recording:
         with self._lock:
             if self.folder is not None:
                 raise InputError(f"it is recorded already, to {self._folder}")
-            self._folder = fresh_folder()
+            self._folder = fresh_folder("live")
             service = ServiceConfig(
                 self._rig, self._zenoh, run_dir=self._folder.absolute(), parent=os.getpid()
             )
