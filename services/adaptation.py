@@ -6,6 +6,7 @@ whose seed taught nothing, such as in the first, dark pictures of a camera, is l
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -58,11 +59,7 @@ class Adaptation:
         those of the last frame that are still to come."""
         self._take_in_all()
         reported = {t for t in self._segmenter.threads if self._latest.get(t) in self._segmented}
-        while self._patience and any(self._latest[t] != self._segmented[-1] for t in reported):
-            state = self._states.get(self._patience)
-            if state is None:
-                break
-            self._take_in(state)
+        self._wait_while(lambda: any(self._latest[t] != self._segmented[-1] for t in reported))
 
     def step(self, frame: StereoFrame) -> None:
         """To be called once for every frame that was segmented, after its field was published."""
@@ -80,11 +77,7 @@ class Adaptation:
         self._arrived = list(self._of(frame).values())
 
     def _learn(self, sample: StereoFrame) -> None:
-        while self._patience and self._awaited - self._of(sample).keys():
-            state = self._states.get(self._patience)
-            if state is None:
-                break
-            self._take_in(state)
+        self._wait_while(lambda: bool(self._awaited - self._of(sample).keys()))
         states = self._of(sample)
         all_lost = all(state.status is Status.LOST for state in states.values())
         for thread, message in sorted(states.items()):
@@ -100,6 +93,13 @@ class Adaptation:
                 self._segmenter.adapt(sample, pixels, thread)
             elif all_lost:
                 self._segmenter.fade(thread)
+
+    def _wait_while(self, lacks: Callable[[], bool]) -> None:
+        """In lock-step: takes in states for as long as some lack, and come."""
+        while (
+            self._patience and lacks() and (state := self._states.get(self._patience)) is not None
+        ):
+            self._take_in(state)
 
     def _take_in_all(self) -> None:
         while (state := self._states.get(0)) is not None:
