@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import datetime
+import ipaddress
 import json
 import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -95,6 +96,8 @@ def examine(config: DoctorConfig) -> Iterator[Finding]:
             yield _fault(nothing_runs(config.rig))
         for watch in running:
             yield from _system(watch)
+        if running:
+            yield from _open_ports()
     finally:
         for watch in watches.values():
             watch.close()
@@ -187,15 +190,10 @@ def _disk(folder: Path) -> Finding:
 
 
 def _system(watch: RigWatch) -> Iterator[Finding]:
-    checks: tuple[Callable[[RigWatch], Iterator[Finding]], ...] = (
-        _processes,
-        _rates,
-        _troubles,
-        _clocks,
-        _open_ports,
-    )
-    for check in checks:
-        yield from check(watch)
+    yield from _processes(watch)
+    yield from _rates(watch)
+    yield from _troubles(watch)
+    yield from _clocks(watch)
 
 
 def _processes(watch: RigWatch) -> Iterator[Finding]:
@@ -256,8 +254,7 @@ def _clocks(watch: RigWatch) -> Iterator[Finding]:
             yield Finding(ERROR, f"{watch.rig}: {name}", text, "let chrony or ptp keep the hosts")
 
 
-def _open_ports(watch: RigWatch) -> Iterator[Finding]:
-    del watch
+def _open_ports() -> Iterator[Finding]:
     for port in sorted(listening()):
         text = f"a process of suturetrack listens on {port}"
         yield Finding(WARNING, "network", text, "is that meant? only routers and consoles have to")
@@ -275,10 +272,8 @@ def listening() -> set[str]:
         except psutil.Error:
             continue
         for connection in connections:
-            if connection.status == psutil.CONN_LISTEN and not _is_local(connection.laddr.ip):
-                found.add(f"{connection.laddr.ip}:{connection.laddr.port}")
+            if connection.status == psutil.CONN_LISTEN:
+                address, port = connection.laddr
+                if not ipaddress.ip_address(address).is_loopback:
+                    found.add(f"{address}:{port}")
     return found
-
-
-def _is_local(address: str) -> bool:
-    return address.startswith("127.") or address == "::1"

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from subprocess import PIPE
@@ -163,6 +164,18 @@ def test_a_rig_that_was_named_has_to_run(rig: Bus, name: str, text: str, advice:
     found = list(examine(DoctorConfig(name)))[-1]
     assert (found.level, found.text) == (ERROR, text)
     assert found.advice.endswith(advice)
+
+
+def test_what_others_can_reach_is_told_once_for_all_rigs(
+    rig: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(Bus(ZenohTransport(local_config("other", "source")), "other", "source")) as other:
+        monkeypatch.setattr("services.doctor.listening", lambda: {"0.0.0.0:7447"})
+        say(rig, HEALTHY)
+        say(other, HEALTHY)
+        subjects = [finding.subject for finding in examine(DoctorConfig())]
+    assert {f"{rig.rig}: source", "other: source"} < set(subjects)
+    assert subjects.count("network") == 1
 
 
 def test_status_shows_processes_and_threads(rig: Bus, capsys: pytest.CaptureFixture[str]) -> None:
