@@ -18,7 +18,6 @@ from services.wire import scaled
 from services.writer import Writer
 from suturetrack.camera import StereoRig
 
-PUBLISHERS = tuple(topic.publisher for topic in (topics.FRAME, topics.FIELD, topics.STATE))
 _WAIT_S = 0.02
 
 
@@ -28,7 +27,7 @@ class LiveView:
     Args:
         bus: of a process that only listens.
         rig: the calibrated cameras.
-        writers: what the source, the segmenter and the tracker publish goes to these three.
+        writers: one for what each of `topics.PROCESSES` publishes, in this order.
     """
 
     def __init__(self, bus: Bus, rig: StereoRig, writers: Sequence[Writer | Recorder]) -> None:
@@ -43,7 +42,7 @@ class LiveView:
     @classmethod
     def on(cls, bus: Bus, rig: StereoRig, stream: rr.RecordingStream) -> Self:
         """Writes to one stream."""
-        writers = [Writer(stream, process, "light", rig) for process in PUBLISHERS]
+        writers = [Writer(stream, process, "light", rig) for process in topics.PROCESSES]
         for writer in writers:
             writer.describe()
         stream.send_blueprint(writers[-1].layout())

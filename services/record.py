@@ -8,10 +8,11 @@ from typing import Annotated
 
 import tyro
 
-from services.live import PUBLISHERS, LiveView
+from services.live import LiveView
 from services.output import check_holds_no_run, command, fresh_folder
 from services.recording import Recorder
 from services.service import Service, ServiceConfig
+from services.topics import PROCESSES
 from suturetrack.calibration import save_calibration
 from suturetrack.types import InputError
 
@@ -32,7 +33,7 @@ def run(service: Service, config: RecordConfig) -> None:
         level = config.service.recording
         recorders = [
             stack.enter_context(Recorder(folder, name, level, rig, config, patient=False))
-            for name in PUBLISHERS
+            for name in PROCESSES
         ]
         save_calibration(folder / "calibration.yaml", rig)
         view = LiveView(service.bus, rig, recorders)
