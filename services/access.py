@@ -134,15 +134,13 @@ def common_name(rig: str, role: str) -> str:
 
 def _rules(name: str, rig: str, role: Role, *, said: Flow, heard: Flow) -> list[Rule]:
     """What a role says and what it hears, as flows of the one who applies the rules."""
-    wiring: list[Topic[Any] | Question[Any, Any]]
     published = _keys(role.publishes)
     own = [f"health/{p}" for p in role.processes] + published
     # Who reads health subscribes to that of all processes at once, so each has to allow that.
     read_by_others = _keys([topics.HEALTH] if role.processes else []) + published
-    read = _keys((*role.reads, *role.keeps))
-    served = _keys([*role.answers, *role.keeps])
-    wiring = [*role.asks, *role.recalls]
-    asked = _keys(wiring)
+    read = _keys(role.reads) + _keys(role.keeps)
+    served = _keys(role.answers) + _keys(role.keeps)
+    asked = _keys(role.asks) + _keys(role.recalls)
     here = [topics.alive(p) for p in role.processes]
     everyone = [topics.alive("*")]
     parts: list[tuple[str, Flow, list[str], list[str]]] = [
