@@ -12,7 +12,7 @@ import numpy as np
 
 from services import topics
 from services.bus import Bus, NoAnswer
-from services.client import Client, Refused, Unavailable
+from services.client import Client, Refused
 from services.console import picture
 from services.console.recording import Recording
 from services.messages import Health
@@ -85,7 +85,7 @@ class Feed:
             found = self.client.seed((u, v), view=view, thread=thread)
         except Refused as refusal:
             return {"accepted": False, "text": str(refusal), "candidates": refusal.candidates}
-        except (Unavailable, InputError) as error:
+        except InputError as error:
             return {"accepted": False, "text": str(error), "candidates": []}
         return {"accepted": True, "text": found.reason, "candidates": []}
 
