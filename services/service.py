@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import TYPE_CHECKING, Literal, Self
 
 import psutil
@@ -152,9 +152,7 @@ class Service:
         """Counts a frame whose result has just been published; the time now, ns."""
         now_ns = time.time_ns()
         self.meter.count(stamp, now_ns)
-        if self.recorder is not None:
-            while self._unrecorded:
-                self.recorder.health(self._unrecorded.popleft())
+        self._record_health()
         return now_ns
 
     def complain(self, text: str) -> None:
@@ -194,24 +192,22 @@ class Service:
         self._heartbeat.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self.bus.stop.set()
         self._heartbeat.join()
         last = self.health()
         self.bus.publish(topics.HEALTH, last)
         self._unrecorded.append(last)
+        self._record_health()
         if self.recorder is not None:
-            while self._unrecorded:
-                self.recorder.health(self._unrecorded.popleft())
             if error is not None and not isinstance(error, Stopped):
-                self.recorder.log(f"{kind.__name__ if kind else ''}: {error}", "ERROR")
+                self.recorder.log(f"{type(error).__name__}: {error}", "ERROR")
             self.recorder.close()
         self.bus.close()
+
+    def _record_health(self) -> None:
+        while self.recorder is not None and self._unrecorded:
+            self.recorder.health(self._unrecorded.popleft())
 
     def _beat(self) -> None:
         watchdog = Watchdog()
