@@ -9,12 +9,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 from rich.console import Console
 from rich.progress import track
 
 from services.bench import report
+from services.sources.footage import read_image
 from suturetrack import metrics, nurbs
 from suturetrack.calibration import load_calibration
 from suturetrack.camera import StereoRig
@@ -28,6 +28,7 @@ _SAMPLES = 600
 _ORDER_RADIUS = 0.01
 """How near to the truth a place of the curve is that is in order, as a share of the true length."""
 _IN_ORDER_PERCENT = 95.0
+_ERRORS = ("mean", "largest", "rms", "length", "end", "order")
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def _pairs(folder: Path) -> Iterator[Row]:
         with (folder / "published.csv").open(newline="") as file:
             published = {line["file"]: line for line in csv.DictReader(file)}
     for case in cases:
-        left, right = (_read(case / f"{view}.png") for view in ("left", "right"))
+        left, right = (read_image(case / f"{view}.png") for view in ("left", "right"))
         seed = json.loads((case / "seed.json").read_text())
         truth = None
         if (case / "truth.json").exists():
@@ -153,32 +154,29 @@ def _row(
         segmenter.learn(frame, seed)
         first = initialize(segmenter.step(frame), rig, seed)
     except InitializationError as error:
-        blank = dict.fromkeys((*_ERRORS, "pixels"), nan)
+        errors = dict.fromkeys((*_ERRORS, "pixels"), nan)
         reason, confidence = str(error), 0.0
     else:
-        blank = _errors(first.curve, truth, unit) | {"pixels": first.reprojection_px}
+        errors = _errors(first.curve, truth, unit) | {"pixels": first.reprojection_px}
         reason, confidence = "; ".join(first.reasons), first.confidence
     return Row(
         data=data,
         seed=number,
-        solved=_is_solved(blank, truth, unit),
+        solved=_is_solved(errors, truth, unit),
         confidence=confidence,
-        mean=blank["mean"],
+        mean=errors["mean"],
         published_mean=float(published.get("e_mean", nan)),
-        largest=blank["largest"],
+        largest=errors["largest"],
         published_largest=float(published.get("e_max", nan)),
-        rms=blank["rms"],
-        length_error_percent=blank["length"],
+        rms=errors["rms"],
+        length_error_percent=errors["length"],
         published_length_error_percent=_published_length(published),
-        worst_end=blank["end"],
-        in_order_percent=blank["order"],
-        reprojection_px=blank["pixels"],
+        worst_end=errors["end"],
+        in_order_percent=errors["order"],
+        reprojection_px=errors["pixels"],
         seconds=time.perf_counter() - began,
         reason=reason,
     )
-
-
-_ERRORS = ("mean", "largest", "rms", "length", "end", "order")
 
 
 def _errors(curve: Nurbs, truth: Float64 | None, unit: float) -> dict[str, float]:
@@ -213,10 +211,3 @@ def _published_length(published: dict[str, str]) -> float:
 
 def _dense(curve: Nurbs) -> Float64:
     return nurbs.evaluate(curve, nurbs.evenly_spaced(curve, _SAMPLES))
-
-
-def _read(path: Path) -> np.ndarray:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise InputError(f"pairs: {path} is missing or no image")
-    return image
