@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.console import Console
 from rich.progress import track
 
 from services.bench import report
+from services.bench.system import private_folder, rig_name
 from services.run_folder import RunFolder
 from services.summary import summarize
 from suturetrack.types import InputError
@@ -63,12 +63,12 @@ def run(config: LatencyBench, console: Console) -> list[Row]:
 
 
 def _rows(config: LatencyBench, rate: float, level: str) -> Iterator[Row]:
-    with tempfile.TemporaryDirectory(prefix="suturetrack-") as folder:
+    with private_folder() as folder:
         run_dir = Path(folder) / "run"
         command = [sys.executable, "-m", "services.cli", "run"]
         command += ["--source", f"stage:{config.scenario}", "--fps", f"{rate:g}"]
         command += ["--frames", f"{round(rate * config.seconds)}", "--recording", level]
-        command += ["--run-dir", str(run_dir), "--rig", "bench-latency"]
+        command += ["--run-dir", str(run_dir), "--rig", rig_name("latency")]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise InputError(f"bench latency: {done.stderr.strip().splitlines()[-1:]}")

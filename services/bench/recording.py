@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -17,17 +16,17 @@ from rich.progress import track
 
 from services import topics
 from services.bench import report
+from services.bench.system import private_folder, rig_name
 from services.bus import Bus
 from services.drawing import Level
 from services.messages import Health
 from services.recording import Recorder
-from services.zenoh_transport import ZenohTransport, local_config
+from services.zenoh_transport import ZenohTransport, local_config, remove_sockets
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import Scene, open_scene
 from suturetrack.tracking import Tracker
 from suturetrack.types import InputError, Seed, Stamp, StereoFrame
 
-_RIG = "bench-recording"
 _LEVELS: tuple[Level, ...] = ("light", "full")
 _Key = tuple[Level | None, str]
 """Level and process."""
@@ -114,7 +113,7 @@ def costs(config: RecordingBench, level: Level) -> Iterator[tuple[str, Cost]]:
     """What one frame of each process costs, measured within this process."""
     scene = open_scene(config.scenario)
     for name, hand_over in _loops(scene, config.frames).items():
-        with tempfile.TemporaryDirectory(prefix="suturetrack-") as folder:
+        with private_folder() as folder:
             recorder = Recorder(Path(folder), name, level, scene.rig)
             empty_bytes = (Path(folder) / f"{name}.rrd").stat().st_size
             loop_s, thread_s = 0.0, time.process_time() - time.thread_time()
@@ -151,12 +150,14 @@ def _loops(scene: Scene, frames: int) -> dict[str, list[Callable[[Recorder], Non
 def _rates(config: RecordingBench, level: Level | None, *, lockstep: bool) -> dict[str, float]:
     """Frames a second of each process in a run of real processes, lock-step or at 30 Hz."""
     seed = open_scene(config.scenario).seed_pixel(0)
-    shared = ["--rig", _RIG, *(["--lockstep"] if lockstep else [])]
+    rig = rig_name("recording")
+    shared = ["--rig", rig, *(["--lockstep"] if lockstep else [])]
     with ExitStack() as stack:
         if level is not None:
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="suturetrack-"))
+            folder = stack.enter_context(private_folder())
             shared += ["--run-dir", folder, "--recording", level]
-        bus = Bus(ZenohTransport(local_config(_RIG, "bench")), _RIG, "bench")
+        stack.callback(remove_sockets, rig)
+        bus = Bus(ZenohTransport(local_config(rig, "bench")), rig, "bench")
         stack.callback(bus.close)
         healths = bus.every(topics.HEALTH)
         own = {
