@@ -10,7 +10,7 @@ from scipy.special import erfc
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.polylines import arc_lengths, polyline_length
-from suturetrack.types import Nurbs, RidgeField, Stamp
+from suturetrack.types import Nurbs, RidgeField, Seed, Stamp
 
 WIDTH_PX = 1.5
 FPS = 30
@@ -39,6 +39,17 @@ def thread(
     )
     points = np.r_[np.zeros((1, 3)), np.cumsum(step, axis=0)]
     return points * (length / polyline_length(points)) + [-0.22 * length - 5, -10.0, depth]
+
+
+def seed_at(rig: StereoRig, point: np.ndarray, name: str = "0") -> Seed:
+    """A seed at a (3,) point of a thread, as the left view shows it."""
+    u, v = rig.project_raw(point)[0]
+    return Seed(name, pixel=(float(u), float(v)))
+
+
+def seed_on(rig: StereoRig, points: np.ndarray, name: str = "0") -> Seed:
+    """A seed in the middle of (n, 3) points of a thread."""
+    return seed_at(rig, points[len(points) // 2], name)
 
 
 def curve_through(points: np.ndarray, spans: int = 24) -> Nurbs:

@@ -18,7 +18,7 @@ from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import NOBODY, Neighbour, Neighbours, Strand
 from suturetrack.types import Seed, Stamp, Status, StereoFrame
-from tests.painting import FPS, paint
+from tests.painting import FPS, paint, seed_at
 
 LEVELS = (0.8, 0.8)
 
@@ -107,8 +107,7 @@ def test_an_arc_does_not_slip_onto_the_line_that_cuts_it(rig: StereoRig) -> None
         truth = line((-25, -4.0), (25, -4.0), 6.5 + 0.5 * np.sin(3 * i / FPS))
         field = paint(rig, [truth, stray] if i else [truth], i)
         if i == 0:
-            u, v = rig.project_raw(truth[60])[0]
-            tracker.seed(Seed("0", pixel=(float(u), float(v))))
+            tracker.seed(seed_at(rig, truth[60]))
         state = tracker.step(field).states[0]
         assert state.curve is not None
         off = metrics.curve_error(nurbs.evaluate(state.curve, np.linspace(0, 1, 400)), truth)
@@ -183,8 +182,7 @@ def test_a_tip_that_crosses_its_own_thread_at_a_shallow_angle_is_held(
         truth = hook(radius, 4.0 - 2 * depth * np.sin(np.pi * i / 150) ** 2)
         field = paint(rig, [truth], i)
         if i == 0:
-            u, v = rig.project_raw(truth[60])[0]
-            tracker.seed(Seed("0", pixel=(float(u), float(v))))
+            tracker.seed(seed_at(rig, truth[60]))
         state = tracker.step(field).states[0]
         assert state.curve is not None
         ends = nurbs.evaluate(state.curve, np.array([0.0, 1.0]))

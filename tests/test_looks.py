@@ -31,15 +31,10 @@ from suturetrack.tracking.strands import Neighbour, Neighbours, Strand
 from suturetrack.tracking.strangers import Strangers
 from suturetrack.tracking.sureness import Sureness
 from suturetrack.types import Bool, Nurbs, RidgeField, Seed, Status, ThreadState
-from tests.painting import FPS, paint, thread
+from tests.painting import FPS, paint, seed_at, seed_on, thread
 
 Look = Callable[..., Initialization]
 DELAY = round(0.3 * FPS)
-
-
-def seed_on(rig: StereoRig, points: np.ndarray, name: str = "0") -> Seed:
-    u, v = rig.project_raw(points[len(points) // 2])[0]
-    return Seed(name, pixel=(float(u), float(v)))
 
 
 def rms(state: ThreadState, truth: np.ndarray) -> float:
@@ -798,8 +793,8 @@ def finds(monkeypatch: pytest.MonkeyPatch, **threads: tuple[np.ndarray, float]) 
 
     def look(_field: RidgeField, rig: StereoRig, seed: Seed, *_: object) -> Initialization:
         points, confidence = threads[seed.thread]
-        u, v = rig.project_raw(points[len(points) // 4])[0]
-        alone = initialize(paint(rig, [points], 0), rig, Seed(seed.thread, pixel=(u, v)))
+        start = seed_at(rig, points[len(points) // 4], seed.thread)
+        alone = initialize(paint(rig, [points], 0), rig, start)
         return replace(alone, confidence=confidence, doubts=((), ()))
 
     looks_by(monkeypatch, look)
@@ -895,8 +890,7 @@ def test_a_thread_is_seeded_near_where_it_crosses_a_tracked_one(
     tracker.step(fields[0])
     pixels = rig.project_raw(second)[0]
     away = np.abs(np.hypot(*(pixels - pixels[len(x) // 2]).T) - away_px)
-    u, v = pixels[np.argmin(away)]
-    tracker.seed(Seed("b", pixel=(float(u), float(v))))
+    tracker.seed(seed_at(rig, second[np.argmin(away)], "b"))
     for field in fields[1:]:
         states = tracker.step(field).states
     assert [state.status for state in states] == [Status.TRACKING] * 2

@@ -11,8 +11,8 @@ from suturetrack.polylines import polyline_distances
 from suturetrack.tracking import Tracker, TrackingConfig, paper
 from suturetrack.tracking.config import PaperConfig
 from suturetrack.tracking.spacing import evenly, respace
-from suturetrack.types import Float64, Nurbs, RidgeField, Seed, Status
-from tests.painting import curve_through, paint, thread
+from suturetrack.types import Float64, Nurbs, RidgeField, Status
+from tests.painting import curve_through, paint, seed_at, thread
 
 PX_MM = 0.25
 LEVEL = 0.8
@@ -80,8 +80,7 @@ def test_a_thread_pulled_in_and_drawn_out_keeps_its_control_points_apart(rig: St
     lengths = np.r_[np.linspace(90, 62, 35), np.linspace(62, 95, 25)]
     truths = [along(whole, 5.0, 5.0 + length) for length in lengths]
     tracker = Tracker(rig, TrackingConfig(method="paper"))
-    u, v = rig.project_raw(truths[0][200])[0]
-    tracker.seed(Seed("0", pixel=(float(u), float(v))))
+    tracker.seed(seed_at(rig, truths[0][200]))
     events, counts = set(), []
     least, most = PaperConfig().spacing_px
     for i, truth in enumerate(truths):

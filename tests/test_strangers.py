@@ -15,8 +15,8 @@ from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import NOBODY, Neighbour, Neighbours, Strand
 from suturetrack.tracking.strangers import Strangers
-from suturetrack.types import RidgeField, Seed, Status
-from tests.painting import FPS, curve_through, paint
+from suturetrack.types import RidgeField, Status
+from tests.painting import FPS, curve_through, paint, seed_at
 
 LEVELS = (0.8, 0.8)
 SECONDS = 2.0
@@ -90,8 +90,7 @@ def test_a_curve_that_the_thread_has_left_is_not_called_tracking(
 ) -> None:
     """However sure its first look was, while no other finds the thread."""
     shown = fields(rig, (0.0, 0.0), (3.0, 7.0))
-    u, v = rig.project_raw(line()[200])[0]
-    seed = Seed("0", pixel=(float(u), float(v)))
+    seed = seed_at(rig, line()[200])
     first = initialize(paint(rig, [line()], 0), rig, seed)
     looks = iter([replace(first, confidence=0.9)])
 
@@ -116,8 +115,7 @@ def test_what_branched_off_a_curve_says_nothing_of_the_one_that_takes_its_place(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = fields(rig, (0.0, 0.0), (1.0, 4.5))
-    u, v = rig.project_raw(line()[200])[0]
-    seed = Seed("0", pixel=(float(u), float(v)))
+    seed = seed_at(rig, line()[200])
     first = replace(initialize(paint(rig, [line()], 0), rig, seed), confidence=0.9)
     looks: list[RidgeField] = []
 

@@ -26,12 +26,7 @@ from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Evidence
 from suturetrack.tracking.sampling import Samples
 from suturetrack.types import Nurbs, RidgeField, Seed, Status, ThreadState
 from tests.conftest import make_rig
-from tests.painting import FPS, curve_through, paint, stamp, thread
-
-
-def seed_on(rig: StereoRig, points: np.ndarray, name: str = "0") -> Seed:
-    u, v = rig.project_raw(points[len(points) // 2])[0]
-    return Seed(name, pixel=(float(u), float(v)))
+from tests.painting import FPS, curve_through, paint, seed_on, stamp, thread
 
 
 def error(state: ThreadState, truth: np.ndarray) -> metrics.CurveError:
