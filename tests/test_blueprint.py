@@ -5,8 +5,7 @@ from __future__ import annotations
 import ctypes.util
 import socket
 import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -36,6 +35,7 @@ from suturetrack.types import (
     ThreadState,
     Truth,
 )
+from tests.conftest import wait_until
 
 FRAMES = 12
 GRAPHICS = (
@@ -135,7 +135,7 @@ def headless_viewer(run_dir: Path) -> Iterator[ViewerClient]:
     try:
         client = _connected(port)
         client.open(files(RunFolder(run_dir)))
-        _wait_until(lambda: client.get_state().active_recording is not None)
+        wait_until(lambda: client.get_state().active_recording is not None, 60)
         yield client
     finally:
         process.kill()
@@ -153,15 +153,8 @@ def _connected(port: int) -> ViewerClient:
             return False
         return True
 
-    _wait_until(answers)
+    wait_until(answers, 60)
     return clients[-1]
-
-
-def _wait_until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "the viewer does not answer"
-        time.sleep(0.1)
 
 
 @pytest.mark.skipif(
@@ -183,7 +176,7 @@ def test_the_viewer_shows_the_curve_on_the_thread(
         return float((abs(upper - (90, 220, 70)).max(axis=2) < 40).mean())
 
     with headless_viewer(tmp_path) as client:
-        _wait_until(lambda: green_share() > 1e-3)
+        wait_until(lambda: green_share() > 1e-3, 60)
         for frame in (FRAMES - 1, FRAMES // 2, 0):
             client.set_time("frame", sequence=frame, play_state="paused")
             client.save_screenshot(str(picture))

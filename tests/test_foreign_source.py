@@ -10,6 +10,7 @@ from services.service import ServiceConfig
 from services.tracker import TrackerConfig
 from suturetrack.stage import open_scene
 from suturetrack.types import Stamp, Status, StereoFrame
+from tests.conftest import wait_until
 from tests.test_tiny import Rig
 
 
@@ -22,11 +23,8 @@ def test_frames_of_another_publisher_are_tracked() -> None:
     shared = ServiceConfig()
     rig.start("segmenter", segmenter, SegmenterConfig(shared, seed=(scene.seed_pixel(0),)))
     rig.start("tracker", tracker, TrackerConfig(shared, seed=(scene.seed_pixel(0),)))
-    deadline = time.monotonic() + 60
-    while not camera.alive() >= {"segmenter", "tracker"}:
-        assert time.monotonic() < deadline
-        assert not rig.errors
-        time.sleep(0.01)
+    wait_until(lambda: rig.errors or camera.alive() >= {"segmenter", "tracker"}, 60)
+    assert not rig.errors
     for i in range(3):
         now = time.time_ns()
         camera.publish(topics.FRAME, StereoFrame(Stamp(i, now, now), *scene.render(i)))

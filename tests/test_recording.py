@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-import time
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -577,9 +576,6 @@ def test_recording_goes_on_while_a_reader_looks(
     with Recorder(tmp_path, "tracker", "light", rig, flush_seconds=0) as recorder:
         for i in range(20):
             recorder.states([make_state(curve, stamp=Stamp(i, i, i))])
-        deadline = time.monotonic() + 10
-        while len(RunFolder(tmp_path).states()) < 20 and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert len(RunFolder(tmp_path).states()) == 20
+        wait_until(lambda: len(RunFolder(tmp_path).states()) == 20, 10)
         recorder.states([make_state(curve, stamp=Stamp(20, 20, 20))])
     assert len(RunFolder(tmp_path).states()) == 21

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import threading
-import time
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -73,10 +72,8 @@ class Rig:
 
     def wait(self) -> None:
         """Until the source is done, or any process fails."""
-        deadline = time.monotonic() + 60
-        while self.threads["source"].is_alive() and not self.errors:
-            assert time.monotonic() < deadline, "the source did not end"
-            time.sleep(0.01)
+        source = self.threads["source"]
+        wait_until(lambda: self.errors or not source.is_alive(), 60)
 
     def stop(self) -> None:
         for name, thread in self.threads.items():
