@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import faulthandler
-import shutil
 import signal
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -85,10 +86,17 @@ def curve() -> Nurbs:
     return nurbs.curve_from(3, knots, points)
 
 
+@contextmanager
+def private_sockets() -> Iterator[Path]:
+    """Has all sockets lie in a directory of the test's own, with a short path."""
+    made = tempfile.TemporaryDirectory(prefix="suturetrack-", ignore_cleanup_errors=True)
+    with made as directory, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", directory)
+        yield Path(directory)
+
+
 @pytest.fixture
-def rig_name(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Name of a rig whose sockets lie in a directory of the test's own, with a short path."""
-    directory = tempfile.mkdtemp(prefix="suturetrack-")
-    monkeypatch.setenv("XDG_RUNTIME_DIR", directory)
-    yield "test"
-    shutil.rmtree(directory)
+def rig_name() -> Iterator[str]:
+    """Name of a rig with `private_sockets`."""
+    with private_sockets():
+        yield "test"

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Coroutine, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +17,7 @@ import pytest
 from services.run_folder import RunFolder
 from suturetrack.stage import open_scene
 from tests.browser import EXECUTABLE, Browser, Tab
+from tests.conftest import private_sockets
 
 pytestmark = pytest.mark.skipif(EXECUTABLE is None, reason="there is no Chromium")
 
@@ -44,31 +42,28 @@ class System:
 @pytest.fixture(scope="module")
 def system() -> Iterator[System]:
     """A source that never ends, segmenter, tracker without a seed, and the console."""
-    directory = tempfile.mkdtemp(prefix="suturetrack-")
-    environment = {**os.environ, "XDG_RUNTIME_DIR": directory}
     verbs = {
         "console": ("--port", "0"),
         "source": ("--source", f"stage:{SCENE}", "--loop", "3", "--fps", "5"),
         "segmenter": (),
         "tracker": (),
     }
-    processes = {
-        name: subprocess.Popen(
-            [sys.executable, "-m", "services.cli", name, *options],
-            cwd=directory,
-            env=environment,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for name, options in verbs.items()
-    }
-    output = processes["console"].stdout
-    assert output is not None
-    yield System(output.readline().strip(), Path(directory), processes)
-    for process in processes.values():
-        process.kill()
-        process.communicate()
-    shutil.rmtree(directory, ignore_errors=True)
+    with private_sockets() as directory:
+        processes = {
+            name: subprocess.Popen(
+                [sys.executable, "-m", "services.cli", name, *options],
+                cwd=directory,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            for name, options in verbs.items()
+        }
+        output = processes["console"].stdout
+        assert output is not None
+        yield System(output.readline().strip(), directory, processes)
+        for process in processes.values():
+            process.kill()
+            process.communicate()
 
 
 def in_browser(flow: Coroutine[Any, Any, None]) -> None:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from suturetrack.stage import open_scene
+from tests.conftest import private_sockets
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SCENE = "figure8-107"
@@ -23,25 +21,23 @@ SCENE = "figure8-107"
 @pytest.fixture(scope="module")
 def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Starts Python with these words, beside a running system that has no seed yet."""
-    directory = tempfile.mkdtemp(prefix="suturetrack-")
-    environment = {**os.environ, "XDG_RUNTIME_DIR": directory}
     started: list[subprocess.Popen[str]] = []
 
     def begin(*words: object) -> subprocess.Popen[str]:
         pipe = subprocess.PIPE
         command = [sys.executable, *map(str, words)]
-        process = subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True)
+        process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True)
         started.append(process)
         return process
 
     source = ("--source", f"stage:{SCENE}", "--loop", 3, "--fps", 10)
-    for verb in (("source", *source), ("segmenter",), ("tracker",)):
-        begin("-m", "services.cli", *verb)
-    yield begin
-    for process in started:
-        process.kill()
-        process.communicate()
-    shutil.rmtree(directory, ignore_errors=True)
+    with private_sockets():
+        for verb in (("source", *source), ("segmenter",), ("tracker",)):
+            begin("-m", "services.cli", *verb)
+        yield begin
+        for process in started:
+            process.kill()
+            process.communicate()
 
 
 def lines(process: subprocess.Popen[str], pattern: str) -> Iterator[re.Match[str]]:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import os
 import random
-import shutil
 import signal
-import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +20,7 @@ from services.run_folder import RunFolder
 from services.topics import PROCESSES
 from suturetrack import nurbs
 from suturetrack.types import InputError, Status
+from tests.conftest import private_sockets
 
 FPS = 30.0
 SOON_S = 15.0
@@ -33,15 +31,6 @@ SOON_S = 15.0
 def options(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Of a run that shows a film without end."""
     return film(tmp_path_factory.mktemp("film") / "pairs", 20, FPS)
-
-
-@contextmanager
-def private_sockets() -> Iterator[None]:
-    directory = tempfile.mkdtemp(prefix="suturetrack-")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_RUNTIME_DIR", directory)
-        yield
-    shutil.rmtree(directory)
 
 
 @pytest.fixture(scope="module")
