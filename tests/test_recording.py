@@ -529,7 +529,7 @@ ENDING = """
             if service.bus.stop.wait(0.01):
                 return
 
-    run("source", ServiceConfig(rig=sys.argv[3], run_dir=Path(sys.argv[1])), body)
+    run("tracker", ServiceConfig(rig=sys.argv[3], run_dir=Path(sys.argv[1])), body)
 """
 
 
@@ -548,10 +548,10 @@ def test_a_process_that_ends_in_order_loses_nothing(tmp_path: Path, end: str) ->
     assert last >= 40
     folder = RunFolder(tmp_path)
     assert folder.problems == []
-    assert folder.handled("source") == set(range(last + 1))
-    told = [r["TextLog:text"][0] for r in rows(folder, "/log/source")]
-    assert told == (["source: RuntimeError: out of thread"] if end == "exception" else [])
-    assert rows(folder, "/plots/rate_hz/source")
+    assert folder.handled("tracker") == set(range(last + 1))
+    told = [r["TextLog:text"][0] for r in rows(folder, "/log/tracker")]
+    assert told == (["tracker: RuntimeError: out of thread"] if end == "exception" else [])
+    assert rows(folder, "/plots/rate_hz/tracker")
 
 
 def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
