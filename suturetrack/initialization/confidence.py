@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.initialization.doubts import (
+    BENT,
     BEYOND,
     CROSSING,
     FADES,
@@ -141,7 +142,7 @@ def _left_in_doubt(
     doubts = [_confirmed(view, doubts, lines) for view in (0, 1)]
     if max(_others(line, r) for line, r in zip(lines, ridges, strict=True)) > _NEXT_TO_NOTHING:
         return doubts
-    return [[_of_itself(doubt) for doubt in of_view] for of_view in doubts]
+    return [[_of_itself(d, p) for d in of_view] for of_view, p in zip(doubts, lines, strict=True)]
 
 
 def _in_words(doubts: list[list[Doubt]], rig: StereoRig, scale: int) -> list[str]:
@@ -188,7 +189,7 @@ def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
     """
     kept = []
     for doubt in doubts:
-        near = np.flatnonzero(np.linalg.norm(line - doubt.place, axis=1) <= _SAME_PLACE_PX)
+        near = _near(doubt, line)
         if (
             doubt.why in (*FOREIGN, BEYOND, HIDDEN)
             or not _is_one_pass(line, near)
@@ -271,11 +272,18 @@ def _others(line: Float64, ridges: Ridges) -> float:
     return int((ridges.sample(away) > level).sum()) / max(polyline_length(line), 1.0)
 
 
-def _of_itself(doubt: Doubt) -> Doubt:
-    """A doubt about where the thread goes on, of one that is alone: it meets nothing but itself."""
-    if doubt.why not in (CROSSING, SHARED):
+def _of_itself(doubt: Doubt, line: Float64) -> Doubt:
+    """A doubt about where the thread, (k, 2) pixels, goes on, of one that is alone: it meets nothing but
+    itself, and where it ends at a crossing, another one would have to begin."""
+    is_bent = doubt.why == BENT and not _is_one_pass(line, _near(doubt, line))
+    if not is_bent and doubt.why not in (CROSSING, SHARED):
         return doubt
     return doubt._replace(rest=_ALONE * doubt.rest / (_ALONE * doubt.rest + 1 - doubt.rest))
+
+
+def _near(doubt: Doubt, line: Float64) -> Int64:
+    """Which points of the curve, (k, 2) pixels, are near the place of a doubt."""
+    return np.flatnonzero(np.linalg.norm(line - doubt.place, axis=1) <= _SAME_PLACE_PX)
 
 
 def _is_one_pass(line: Float64, near: Int64) -> bool:
