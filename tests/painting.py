@@ -52,6 +52,12 @@ def seed_on(rig: StereoRig, points: np.ndarray, name: str = "0") -> Seed:
     return seed_at(rig, points[len(points) // 2], name)
 
 
+def kinked(points: np.ndarray, by: float) -> np.ndarray:
+    """(601, 3) points of a thread, with a kink in depth in its middle, so far away."""
+    peak = np.clip(1 - np.abs(np.arange(601) - 300) / 60, 0, 1)[:, None]
+    return np.asarray(points * (1 + by / points[300, 2] * peak))
+
+
 def curve_through(points: np.ndarray, spans: int = 24) -> Nurbs:
     """A cubic curve on (m, 3) points, parametrised like their arc length."""
     travelled = arc_lengths(points)

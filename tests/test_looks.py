@@ -31,7 +31,7 @@ from suturetrack.tracking.strands import Neighbour, Neighbours, Strand
 from suturetrack.tracking.strangers import Strangers
 from suturetrack.tracking.sureness import Sureness
 from suturetrack.types import Bool, Nurbs, RidgeField, Seed, Status, ThreadState
-from tests.painting import FPS, paint, seed_at, seed_on, thread
+from tests.painting import FPS, kinked, paint, seed_at, seed_on, thread
 
 Look = Callable[..., Initialization]
 DELAY = round(0.3 * FPS)
@@ -694,29 +694,36 @@ def test_doubts_run_with_the_curve(rig: StereoRig) -> None:
     np.testing.assert_allclose(turned.curve.control_points, found.curve.control_points[::-1])
 
 
-@pytest.mark.parametrize("other", [False, True])
+@pytest.mark.parametrize(
+    ("how", "is_known"), [("the same", True), ("kinked in depth", False), ("elsewhere", False)]
+)
 def test_what_was_followed_for_sure_is_known_again(
-    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, other: bool
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, how: str, is_known: bool
 ) -> None:
     """However doubtful it looks by itself, but nothing else is."""
     lost_at = 6
-    truth, elsewhere = thread(0.0), thread(0.0) + np.array([0.0, 6.0, 0.0])
-    confidences = iter([0.9])
+    truth = thread(0.0)
+    elsewhere, bent = truth + np.array([0.0, 6.0, 0.0]), kinked(truth, 4.0)
+    later = {"the same": truth, "kinked in depth": bent, "elsewhere": elsewhere}[how]
 
     def look(field: RidgeField, rig: StereoRig, _: Seed, config: object) -> Initialization:
-        confidence = next(confidences, 0.3)
-        points = elsewhere if other and confidence < 0.5 else truth
-        return replace(initialize(field, rig, seed_on(rig, points)), confidence=confidence)
+        is_first = field.stamp.frame == 0
+        found = initialize(field, rig, seed_on(rig, truth if is_first else later))
+        return replace(found, confidence=0.9 if is_first else 0.3)
 
     loses_the_first(monkeypatch, lost_at)
     looks_by(monkeypatch, look)
-    fields = [paint(rig, [truth, elsewhere], i) for i in range(12)]
+    fields = [
+        paint(rig, [bent if later is bent and i >= lost_at else truth, elsewhere], i)
+        for i in range(12)
+    ]
     tracker = Tracker(rig)
     tracker.seed(seed_on(rig, truth))
     states = [tracker.step(field).states[0] for field in fields]
     assert states[lost_at - 1].status is Status.TRACKING
     assert any("found again" in state.events for state in states)
-    assert states[-1].status is (Status.OCCLUDED if other else Status.TRACKING)
+    assert rms(states[-1], later) < 0.3
+    assert states[-1].status is (Status.TRACKING if is_known else Status.OCCLUDED)
 
 
 def test_what_was_taken_for_the_thread_since_does_not_tell_its_length_alone(

@@ -26,7 +26,7 @@ from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Evidence
 from suturetrack.tracking.sampling import Samples
 from suturetrack.types import Nurbs, RidgeField, Seed, Status, ThreadState
 from tests.conftest import make_rig
-from tests.painting import FPS, curve_through, paint, seed_on, stamp, thread
+from tests.painting import FPS, curve_through, kinked, paint, seed_on, stamp, thread
 
 
 def error(state: ThreadState, truth: np.ndarray) -> metrics.CurveError:
@@ -439,15 +439,39 @@ def test_an_edge_that_draws_a_bow_straight_is_not_called_tracking(
 def test_a_kink_in_depth_that_no_view_shows_is_not_called_tracking(
     rig: StereoRig, start_s: float
 ) -> None:
+    grows = 6.0 * np.clip((np.arange(45) - 20) / 8, 0, 1) * (np.arange(45) < 36)
     truths = [thread(start_s + i / FPS / 3) for i in range(45)]
-    kink = np.clip(1 - np.abs(np.arange(601) - 300) / 60, 0, 1)[:, None]
-    shows = [points * (1 + 0.03 * kink * (20 <= i < 32)) for i, points in enumerate(truths)]
-    fields = [paint(rig, [points], i) for i, points in enumerate(shows)]
+    shown = [kinked(points, by) for points, by in zip(truths, grows, strict=True)]
+    fields = [paint(rig, [points], i) for i, points in enumerate(shown)]
     states = follow(fields, rig, seed_on(rig, truths[0]))
-    assert all(state.status is Status.TRACKING for state in states[:20] + states[35:])
-    for state, truth in list(zip(states, truths, strict=True))[20:25]:
+    assert all(state.status is Status.TRACKING for state in states[:20] + states[40:])
+    for state, truth in list(zip(states, truths, strict=True))[28:31]:
         assert error(state, truth).largest > 4.0
         assert state.status is Status.OCCLUDED
+
+
+@pytest.mark.parametrize("start_s", [0.0, 0.7, 1.5])
+def test_a_curve_does_not_spring_aside_in_depth(rig: StereoRig, start_s: float) -> None:
+    truths = [thread(start_s + i / FPS / 3) for i in range(45)]
+    fields = [
+        paint(rig, [kinked(points, 4.0) if 20 <= i < 32 else points], i)
+        for i, points in enumerate(truths)
+    ]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    for state, truth in zip(states, truths, strict=True):
+        assert error(state, truth).largest < 1.0
+    assert all(state.status is Status.TRACKING for state in states[:28] + states[34:])
+    assert all(state.status is Status.OCCLUDED for state in states[30:32])
+
+
+def test_what_stays_aside_in_depth_is_followed_in_the_end(rig: StereoRig) -> None:
+    truths = [thread(0.7 + i / FPS / 3) for i in range(130)]
+    shown = [kinked(points, 4.0) if i >= 20 else points for i, points in enumerate(truths)]
+    fields = [paint(rig, [points], i) for i, points in enumerate(shown)]
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    for state, points in list(zip(states, shown, strict=True))[30:]:
+        assert state.status is not Status.TRACKING or error(state, points).largest < 2.0
+    assert states[-1].status is Status.TRACKING
 
 
 def test_a_hidden_end_is_held_and_taken_up_again(rig: StereoRig) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from suturetrack.tracking import gauss_newton
 from suturetrack.tracking.alignment import shifted
+from suturetrack.tracking.bends import sprung_in_depth
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.images import Images
-from suturetrack.tracking.reliability import Evidence
+from suturetrack.tracking.reliability import MOST, Evidence
 from suturetrack.tracking.strands import Neighbours
-from suturetrack.types import Nurbs
+from suturetrack.types import Bool, Nurbs
 
 # Searches, in units of the first: tried where less than the second is seen, taken if they show more.
 _WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
@@ -26,8 +29,11 @@ def fit_widely(
     config: TrackingConfig,
     neighbours: Neighbours,
     known_length: float | None,
-) -> Evidence:
-    """Looks further away for what was seen before, and now and then for what is hidden.
+    held: Bool,
+) -> tuple[Evidence, Bool]:
+    """The curve on the field, and (K,) where it is held in depth against what the views show.
+
+    Looks further away for what was seen before, and now and then for what is hidden.
 
     Args:
         before: the curve in the last field.
@@ -37,11 +43,12 @@ def fit_widely(
         config: how far is looked.
         neighbours: other threads that the images show.
         known_length: of the thread, if it is known and all of it is in sight.
+        held: (K,) where it was held in depth in the last field.
     """
 
-    def fitted(start: Nurbs, reach_px: float) -> Evidence:
-        fit = gauss_newton.fit(before, start, images, reach_px, config, neighbours, known_length)
-        return Evidence.of(fit)
+    def fitted(start: Nurbs, reach_px: float, sprung: Bool | None = None) -> Evidence:
+        how = images, reach_px, config, neighbours, known_length, sprung
+        return Evidence.of(gauss_newton.fit(before, start, *how))
 
     best = fitted(predicted, config.search_px)
     usual = 1.0 if images.field.stamp.frame % _RETRY == 0 else share - _DROP
@@ -55,4 +62,7 @@ def fit_widely(
         tried = fitted(predicted, times * config.search_px)
         if tried.share > best.share + gain:
             best = tried
-    return best
+    sprung = sprung_in_depth(predicted, best.fit.curve, images.rig, held)
+    if best.share < MOST or not sprung.any():
+        return best, np.zeros_like(sprung)
+    return fitted(predicted, config.search_px, sprung), sprung

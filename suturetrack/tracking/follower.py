@@ -57,6 +57,8 @@ _PATIENCE_S = 0.06
 _REGROWN_S = _LED_BACK_S = 0.09
 # For how long a hidden end is taken to be where it was, and after how long it is gone.
 _HIDDEN_S, _GONE_S = 0.3, 2.0
+# For how long a curve is called tracking that is held in depth against what the views show.
+_HELD_S = 0.3
 # What has to be seen of the last good curve beyond what is seen of the rest, against the length.
 _MORE = 0.05
 # Places on a thread that keep other threads away.
@@ -96,6 +98,10 @@ class Follower:
         self._doubted_ns = self._regrown_ns = self._led_back_ns = -(1 << 62)
         self._drift = Drift()
         self._bends = Bends(self.rig)
+        self._held: Bool = np.zeros(RELIABILITY_SAMPLES, bool)
+        """Where the curve was held in depth in the last field, against what the views showed."""
+        self._free_ns = now
+        """When it was last held nowhere."""
         self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
         self._share_seen = 1.0
@@ -168,6 +174,8 @@ class Follower:
             model.seen_ns = model.capture_ns
             self._learn_levels(field)
             images = replace(images, levels=model.levels)
+        if not self._held.any():
+            self._free_ns = model.capture_ns
         events = []
         if inserted or removed:
             events.append(f"control points: {inserted} inserted, {removed} removed")
@@ -237,6 +245,7 @@ class Follower:
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
         is_vague = is_kinked or self._drift.gone.mean() > ASTRAY
+        is_vague |= (model.capture_ns - self._free_ns) * _NS > _HELD_S
         is_vague |= any(self._hidden.for_longer_than(_HIDDEN_S))
         is_vague |= bool(self._leaps.any()) and not known.is_reached(length)
         is_vague |= bool(np.sqrt(np.mean(evidence.sigma**2)) > _VAGUE * length)
@@ -299,7 +308,7 @@ class Follower:
         self, images: Images, predicted: Nurbs, neighbours: Neighbours
     ) -> tuple[Evidence, int, int]:
         model = self.model
-        best = fit_widely(
+        best, self._held = fit_widely(
             model.curve,
             predicted,
             images,
@@ -307,6 +316,7 @@ class Follower:
             self.config,
             neighbours.shown_in(images),
             self._own_length(),
+            self._held,
         )
         self._share_seen = best.share
         # What was just drawn out may have been drawn out in depth.

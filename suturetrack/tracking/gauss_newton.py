@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.crowding import Crowd, crowded
 from suturetrack.tracking.ends import end_shift
 from suturetrack.tracking.images import Images
-from suturetrack.tracking.sampling import Samples, View, views
+from suturetrack.tracking.sampling import Samples, View, resampled, views
 from suturetrack.tracking.strands import NOBODY, SAME_STRAND_PX, Neighbours, Strand
 from suturetrack.types import Bool, Float32, Float64, Nurbs
 
@@ -108,6 +108,7 @@ def fit(
     config: TrackingConfig,
     neighbours: Neighbours = NOBODY,
     known_length: float | None = None,
+    sprung: Bool | None = None,
 ) -> Fit:
     """Moves the predicted curve onto the field.
 
@@ -117,11 +118,14 @@ def fit(
         reach_px: how far along the normals the thread is looked for at first.
         neighbours: other threads that the field shows.
         known_length: of the thread, if it is known and all of it is in sight.
+        sprung: (n,) at evenly spaced parameters, what the views tell no depth of.
     """
     samples = Samples.of(predicted.knots, config.samples_per_span)
     reference = _Reference.of(samples, predicted)
     control_points = predicted.control_points
     crowd = _crowd(predicted, samples, images, neighbours)
+    if sprung is not None:
+        crowd = replace(crowd, others=crowd.others | resampled(sprung, samples.s))
     surprise: Float64 | None = None
     tips = [end_shift(predicted, end, images) for end in (0, 1)]
     faded = expected(before, predicted, samples, images)

@@ -11,6 +11,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.nurbs import evaluate
 from suturetrack.polylines import nearest_index
+from suturetrack.tracking.bends import sprung_in_depth
 from suturetrack.tracking.clearness import Clearness
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.images import Images
@@ -310,7 +311,12 @@ class Thread:
         if self.follower is None or self._sureness is None or not self._sureness.is_sure:
             return False
         before = self.follower.model.curve, self.follower.last_good
-        return any(self._sureness.is_same(found, curve) for curve in before)
+        rig, nowhere = self._setup.rig, np.zeros(RELIABILITY_SAMPLES, bool)
+        return any(
+            self._sureness.is_same(found, curve)
+            and not sprung_in_depth(curve, found, rig, nowhere).any()
+            for curve in before
+        )
 
     def _is_stub(self, found: ThreadState) -> bool:
         """Whether a thread that was never sure would be far shorter than it was found before."""
