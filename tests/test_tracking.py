@@ -436,21 +436,6 @@ def test_an_edge_that_draws_a_bow_straight_is_not_called_tracking(
 
 
 @pytest.mark.parametrize("start_s", [0.0, 0.7, 1.5])
-def test_a_kink_in_depth_that_no_view_shows_is_not_called_tracking(
-    rig: StereoRig, start_s: float
-) -> None:
-    grows = 6.0 * np.clip((np.arange(45) - 20) / 8, 0, 1) * (np.arange(45) < 36)
-    truths = [thread(start_s + i / FPS / 3) for i in range(45)]
-    shown = [kinked(points, by) for points, by in zip(truths, grows, strict=True)]
-    fields = [paint(rig, [points], i) for i, points in enumerate(shown)]
-    states = follow(fields, rig, seed_on(rig, truths[0]))
-    assert all(state.status is Status.TRACKING for state in states[:20] + states[40:])
-    for state, truth in list(zip(states, truths, strict=True))[28:31]:
-        assert error(state, truth).largest > 4.0
-        assert state.status is Status.OCCLUDED
-
-
-@pytest.mark.parametrize("start_s", [0.0, 0.7, 1.5])
 def test_a_curve_does_not_spring_aside_in_depth(rig: StereoRig, start_s: float) -> None:
     truths = [thread(start_s + i / FPS / 3) for i in range(45)]
     fields = [

@@ -6,10 +6,10 @@ import numpy as np
 
 from suturetrack.tracking import gauss_newton
 from suturetrack.tracking.alignment import shifted
-from suturetrack.tracking.bends import sprung_in_depth
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.images import Images
 from suturetrack.tracking.reliability import MOST, Evidence
+from suturetrack.tracking.springs import sprung_in_depth
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.types import Bool, Nurbs
 

@@ -97,7 +97,7 @@ class Follower:
         """When it was certain last where the thread runs, and for a moment before."""
         self._doubted_ns = self._regrown_ns = self._led_back_ns = -(1 << 62)
         self._drift = Drift()
-        self._bends = Bends(self.rig)
+        self._bends = Bends()
         self._held: Bool = np.zeros(RELIABILITY_SAMPLES, bool)
         """Where the curve was held in depth in the last field, against what the views showed."""
         self._free_ns = now
@@ -274,7 +274,7 @@ class Follower:
         last = RELIABILITY_SAMPLES - 1
         self.model.curve = nurbs.part(self.model.curve, start / last, 1 - stop / last)
         self._drift.cut(start, stop)
-        self._bends = Bends(self.rig)
+        self._bends = Bends()
 
     def _start_again(self) -> None:
         """Looks from where the thread was last held, from the next field on."""

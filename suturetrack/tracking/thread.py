@@ -11,7 +11,6 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError
 from suturetrack.nurbs import evaluate
 from suturetrack.polylines import nearest_index
-from suturetrack.tracking.bends import sprung_in_depth
 from suturetrack.tracking.clearness import Clearness
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.images import Images
@@ -22,6 +21,7 @@ from suturetrack.tracking.pursuit import Pursuit
 from suturetrack.tracking.recovery import Setup
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
 from suturetrack.tracking.searches import Again, Closer, FromSeed, Search, lengths
+from suturetrack.tracking.springs import sprung_in_depth
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.tracking.strangers import Strangers
 from suturetrack.tracking.sureness import SURE, Sureness
