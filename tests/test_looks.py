@@ -495,6 +495,18 @@ def test_looks_settle_doubts_about_a_curve_of_one_length(rig: StereoRig, as_long
     assert sureness.is_sure == as_long
 
 
+def test_a_sure_look_outweighs_doubtful_ones_of_another_length(rig: StereoRig) -> None:
+    looks = [look_at(rig, thread(0.6 * turn), 0.8) for turn in range(4)]
+    for i in (0, 1):
+        shorter = nurbs.part(looks[i].curve, 0.0, 0.99)
+        looks[i] = replace(looks[i], curve=shorter, confidence=0.45, doubts=(((0.5, 0.4),), ()))
+    sureness = Sureness(looks[0], looks[0].curve, 0, rig)
+    for look in looks[1:]:
+        assert not sureness.is_sure
+        sureness.weigh(look, look.curve)
+    assert sureness.is_sure
+
+
 @pytest.mark.parametrize(("confidence", "is_sure"), [(0.08, True), (0.03, False)])
 def test_a_hopeless_look_settles_no_doubts(
     rig: StereoRig, confidence: float, is_sure: bool
@@ -640,7 +652,7 @@ def lens(height: float) -> np.ndarray:
     return np.c_[x, 0.01 * x**2 + height * bulge, np.full(600, 200.0)]
 
 
-@pytest.mark.parametrize(("confidence", "is_put_right"), [(0.2, True), (0.05, False)])
+@pytest.mark.parametrize(("confidence", "is_put_right"), [(0.6, True), (0.4, False)])
 def test_a_curve_that_another_ridge_has_drawn_aside_is_put_right_by_a_look(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch, confidence: float, is_put_right: bool
 ) -> None:

@@ -43,8 +43,8 @@ class Sureness:
     order but for what the curve may lack at an end, and against it if it finds another. A sure look has
     one vote, any other the square of its confidence against that. What is voted down gives way to what
     the last look found. Looks are added up along one length only, unless both are sure: what has another
-    one counts instead, if it has more votes. A look at the same picture says nothing new: it counts only
-    if the thread has bent since the last one that did, or if it is sure by itself.
+    one counts instead, if it has more votes, or alone a sure look. A look at the same picture says nothing
+    new: it counts only if the thread has bent since the last one that did, or if it is sure by itself.
 
     A place that one look doubts may be clear in another one that finds the same: of each doubt of the
     first look only the least is left that any has there. No votes outweigh one that stays.
@@ -130,11 +130,14 @@ class Sureness:
         self._shape = self._outline(found.curve if is_outvoted else followed)
         return is_outvoted
 
-    def outweighs(self, confidence: float, found: Nurbs, followed: Nurbs, *, likely: float) -> bool:
-        """Whether a look that found a curve of the thread's length, in the direction of what is followed,
-        tells that this runs elsewhere: beside it, where it is `likely`, or anywhere, where it is sure."""
-        away = self._away(found, followed)
-        return away >= _SAME_PX and confidence >= (likely if away < _OTHER_PX else SURE)
+    def outweighs(
+        self, found: Initialization, now: Nurbs, followed: Nurbs, *, makes_detour: bool
+    ) -> bool:
+        """Whether a look that found a curve of the thread's length, which is followed to where it is now,
+        tells that this runs elsewhere: any that is sure, and one beside what makes a detour."""
+        away = self._away(now, followed)
+        is_likely = found.confidence >= SURE or (makes_detour and away < _OTHER_PX)
+        return is_likely and away >= _SAME_PX
 
     def is_same(self, found: Nurbs, followed: Nurbs) -> bool:
         """Whether what was found is what is followed, which may lack a little at its ends."""
@@ -156,7 +159,7 @@ class Sureness:
             doubts = _lessened(self._doubts, found.doubts) if is_as_long else found.doubts
             self._votes, self._doubts, self._length = self._votes + votes, doubts, length
             self.confidence = max(self.confidence, found.confidence)
-        elif votes > self._votes:
+        elif votes > self._votes or found.confidence >= SURE > self.confidence:
             self._begin(found, votes)
         is_enough = self._votes >= _ENOUGH and remaining(self._doubts) >= SURE
         self.is_sure = is_enough or found.confidence >= self._single

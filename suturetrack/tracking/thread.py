@@ -39,9 +39,8 @@ _ATTEMPTS = 12
 _LOOKS = 2
 # A thread that was never sure is no stub of what it was found as with some hope, against the longest.
 _STUB = 0.5
-# The pause between looks at a curve that other ridges may draw aside, and the confidence of one by which
-# they have.
-_PAUSE_NS, _LIKELY = 500_000_000, 0.1
+# The pause between looks at a curve that other ridges may draw aside.
+_PAUSE_NS = 500_000_000
 FOUND, GIVEN_UP = "found", "given up"
 """Events of what came of a seed."""
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
@@ -380,8 +379,8 @@ class Thread:
             return False
         if known.is_exceeded(state.length, 0.0):
             return False
-        likely = 0.0 if self.follower.makes_detour else _LIKELY
-        return self._sureness.outweighs(found.confidence, state.curve, curve, likely=likely)
+        makes_detour = self.follower.makes_detour
+        return self._sureness.outweighs(found, state.curve, curve, makes_detour=makes_detour)
 
     @property
     def _may_be_aside(self) -> bool:
