@@ -245,7 +245,8 @@ def test_a_rig_runs_behind_the_router(tmp_path: Path) -> None:
     ]
     try:
         with connect(zenoh=domain / "rig-operator.json5") as client:
-            wait_until(lambda: bool(seeded(client)), 60)
+            # The kernels may have to be compiled first.
+            wait_until(lambda: bool(seeded(client)), 180)
             wait_until(lambda: (seen := client.latest()) is not None and seen.live, 20)
             assert client.grasp(fraction=0.5).position[2] > 0.1
         with connect(zenoh=domain / "rig-viewer.json5") as viewer:

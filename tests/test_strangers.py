@@ -15,6 +15,7 @@ from suturetrack.tracking.images import Images
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.strands import NOBODY, Neighbour, Neighbours, Strand
 from suturetrack.tracking.strangers import Strangers
+from suturetrack.tracking.sureness import Sureness
 from suturetrack.types import RidgeField, Status
 from tests.painting import FPS, curve_through, paint, seed_at
 
@@ -126,7 +127,7 @@ def test_what_branched_off_a_curve_says_nothing_of_the_one_that_takes_its_place(
 
     monkeypatch.setattr("suturetrack.tracking.recovery.initialize", look)
     # No look puts the curve right before it is revoked.
-    monkeypatch.setattr("suturetrack.tracking.thread._LIKELY", 2.0)
+    monkeypatch.setattr(Sureness, "outweighs", lambda *_, **__: False)
     tracker = Tracker(rig)
     tracker.seed(seed)
     states = [tracker.step(field).states[0] for field in shown]
