@@ -99,6 +99,7 @@ def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(
     tmp_path: Path, whole: Path, name: str
 ) -> None:
     size = (whole / name).stat().st_size
+    rows = len(list(RunFolder(whole).rows("/**")))
     rng = np.random.default_rng(len(name))
     kept = []
     for cut in (0, 40, *sorted(rng.integers(100, size, 4).tolist()), size - 1):
@@ -109,7 +110,9 @@ def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(
         for verb in ("inspect", "compare", "view"):
             assert said[verb] == "", (cut, verb)
         folder = RunFolder(broken)
-        assert any(problem.startswith(name) for problem in folder.problems)
+        # Cut between two messages, or in the 16 bytes that open one, a file shows no damage.
+        if not any(problem.startswith(name) for problem in folder.problems):
+            assert len(list(folder.rows("/**"))) < rows
         kept.append(len(folder.handled(name.removesuffix(".rrd"))))
     assert kept == sorted(kept)
     assert kept[0] == 0
