@@ -21,6 +21,7 @@ from services.messages import (
 )
 from suturetrack.camera import LARGEST_SIDE, Camera, StereoRig
 from suturetrack.types import (
+    Colours,
     Energies,
     Grasp,
     InputError,
@@ -93,6 +94,16 @@ def _field(field: RidgeField) -> None:
         # NaN fails both comparisons.
         bounded = view.min() >= -1.001 and view.max() <= 1.001
         _require(bounded, "a field holds components that are not within [-1, 1]")
+    for colours in field.colours or ():
+        _colours(colours, shape)
+
+
+def _colours(colours: Colours, shape: tuple[int, ...]) -> None:
+    pixels = colours.pixels.astype(np.int64)
+    inside = (pixels < (shape[1], shape[0])).all()
+    _require(inside, "colours of pixels outside the view")
+    order = pixels[:, 1] * shape[1] + pixels[:, 0]
+    _require((np.diff(order) > 0).all(), "colours of pixels that are not in order, row by row")
 
 
 def _curve(curve: Nurbs) -> None:

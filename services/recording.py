@@ -235,4 +235,4 @@ class Recorder:
 
 def _copied(field: RidgeField) -> RidgeField:
     own = {name: (left.copy(), right.copy()) for name, (left, right) in field.own.items()}
-    return RidgeField(field.stamp, field.left.copy(), field.right.copy(), own)
+    return replace(field, left=field.left.copy(), right=field.right.copy(), own=own)

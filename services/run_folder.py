@@ -9,7 +9,7 @@ import tempfile
 import warnings
 import weakref
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,6 +25,7 @@ from services.writer import Request
 from suturetrack.camera import Camera, StereoRig
 from suturetrack.segmentation import joined
 from suturetrack.types import (
+    Colours,
     Energies,
     Float32,
     Float64,
@@ -154,9 +155,12 @@ class RunFolder:
 
     def fields(self) -> Iterator[RidgeField]:
         """All fields of a full recording in order, each read when it is asked for."""
-        for stamp, left, right in self._pairs("field", _field):
+        for stamp, (left, left_colours), (right, right_colours) in self._pairs("field", _field):
             own = {name: (left[name], right[name]) for name in left if name}
-            yield joined(stamp, own) if own else RidgeField(stamp, left[""], right[""])
+            field = joined(stamp, own) if own else RidgeField(stamp, left[""], right[""])
+            if left_colours is not None and right_colours is not None:
+                field = replace(field, colours=(left_colours, right_colours))
+            yield field
 
     def _parsed(self, rows: Iterable[Row], parse: Callable[[Row], T], what: str) -> list[T]:
         """The values in the rows; what a newer version wrote in another form is left out."""
@@ -311,12 +315,16 @@ def _image(row: Row) -> Image | None:
     return None
 
 
-def _field(row: Row) -> dict[str, Float32] | None:
-    """The fields of several threads, by name, or under no name that of all."""
+def _field(row: Row) -> tuple[dict[str, Float32], Colours | None] | None:
+    """The fields of several threads, by name, or under no name that of all; and the colours."""
     if "RidgeField:vectors" not in row:
         return None
     vectors = row["RidgeField:vectors"].reshape(-1, *row["RidgeField:shape"])
-    return dict(zip(row.get("RidgeField:threads", ("",)), vectors, strict=True))
+    fields = dict(zip(row.get("RidgeField:threads", ("",)), vectors, strict=True))
+    if "RidgeField:pixels" not in row:
+        return fields, None
+    pixels, bgr = row["RidgeField:pixels"].reshape(-1, 2), row["RidgeField:bgr"].reshape(-1, 3)
+    return fields, Colours(pixels, bgr)
 
 
 def _part(file: Path) -> tuple[str, int]:

@@ -1,8 +1,9 @@
 """Types <-> bytes.
 
 Frames and fields travel as their raw arrays, left then right; those of several threads one after the
-other. The header in the attachment gives shapes, dtype, stamp and threads. Everything else travels as
-MessagePack, arrays as nested lists. The encoding names the schema and its version:
+other, and behind them the colours: the pixels of both views, then what is seen there. The header in
+the attachment gives shapes, dtype, stamp, threads and counts. Everything else travels as MessagePack,
+arrays as nested lists. The encoding names the schema and its version:
 `application/octet-stream;frame/1`, `application/msgpack;state/1`. Lengths on the wire are in metres.
 """
 
@@ -32,6 +33,7 @@ from services.messages import (
 from suturetrack.camera import LARGEST_SIDE, StereoRig
 from suturetrack.segmentation import joined
 from suturetrack.types import (
+    Colours,
     Grasp,
     Nurbs,
     RidgeField,
@@ -51,8 +53,11 @@ MOST_THREADS = 64
 
 _RAW: dict[type[Any], tuple[str, np.dtype[Any]]] = {
     StereoFrame: ("frame/1", np.dtype("<u1")),
-    RidgeField: ("field/2", np.dtype("<f4")),
+    RidgeField: ("field/3", np.dtype("<f4")),
 }
+_PLACE = np.dtype("<u2")
+_COLOURED = 2 * _PLACE.itemsize + 3
+"""Bytes of a pixel's place and colour."""
 _SMALL: dict[type[Any], str] = {
     ThreadState: "state/1",
     Truth: "truth/1",
@@ -116,6 +121,9 @@ class Header(msgspec.Struct, frozen=True):
     threads: Annotated[list[_Name], msgspec.Meta(max_length=MOST_THREADS)] = []
     """Of a field, where several have one of their own: whose left and right follow one another. The
     field of all has the longest of their vectors at each pixel."""
+    colours: Annotated[list[_Count], msgspec.Meta(max_length=2)] = []
+    """Of a field of colour images: of how many pixels of the left and of the right view they follow the
+    shapes. First come the (u, v) of both views, two bytes each, then their blue, green and red."""
 
 
 def encoding_of(kind: type[Any]) -> str:
@@ -130,12 +138,18 @@ def encode(message: object, publisher: str = "", number: int = 0, sent_ns: int =
     kind = type(message)
     if isinstance(message, StereoFrame | RidgeField):
         own = message.own if isinstance(message, RidgeField) else {}
+        colours = (message.colours or ()) if isinstance(message, RidgeField) else ()
         pairs: list[tuple[Any, Any]] = [*own.values()] or [(message.left, message.right)]
         views = [np.ascontiguousarray(v, _RAW[kind][1]) for v in itertools.chain(*pairs)]
         stamp = (message.stamp.frame, message.stamp.capture_ns, message.stamp.released_ns)
         shapes = [list(v.shape) for v in views]
         dtype, period_ns = views[0].dtype.str, message.stamp.period_ns
-        header = Header(publisher, number, sent_ns, stamp, period_ns, dtype, shapes, list(own))
+        counts = [len(of_view.pixels) for of_view in colours]
+        header = Header(
+            publisher, number, sent_ns, stamp, period_ns, dtype, shapes, list(own), counts
+        )
+        views += [np.ascontiguousarray(of_view.pixels, _PLACE) for of_view in colours]
+        views += [np.ascontiguousarray(of_view.bgr) for of_view in colours]
         payload = b"".join(view.data for view in views)
     else:
         header = Header(publisher, number, sent_ns)
@@ -173,26 +187,50 @@ def decode(packet: Packet, kind: type[T]) -> tuple[T, Header]:
 
 def _decode_raw(packet: Packet, kind: type[Any], header: Header) -> Any:
     dtype = _RAW[kind][1]
+    _check_raw(packet, kind, header)
+    payload = bytes(packet.payload)
+    sizes = [math.prod(shape) for shape in header.shapes]
+    data = np.frombuffer(payload, dtype, sum(sizes))
+    parts = np.split(data, np.cumsum(sizes)[:-1])
+    views = [p.reshape(s) for p, s in zip(parts, header.shapes, strict=True)]
+    assert header.stamp is not None  # as was checked
+    stamp, pairs = Stamp(*header.stamp, header.period_ns), zip(views[::2], views[1::2], strict=True)
+    if kind is StereoFrame:
+        return StereoFrame(stamp, *next(pairs))
+    colours = _colours(payload[data.nbytes :], header.colours)
+    if not header.threads:
+        return RidgeField(stamp, *next(pairs), colours=colours)
+    if any(view.shape != views[0].shape or view.shape[2:] != (2,) for view in views):
+        raise WireError(f"fields of shapes {header.shapes}, expected (H, W, 2) all alike")
+    return joined(stamp, dict(zip(header.threads, pairs, strict=True)), colours)
+
+
+def _check_raw(packet: Packet, kind: type[Any], header: Header) -> None:
+    dtype = _RAW[kind][1]
     if header.dtype != dtype.str:
         raise WireError(f"dtype {header.dtype!r}, expected {dtype.str!r}")
     if header.stamp is None or len(header.shapes) != 2 * max(len(header.threads), 1):
         raise WireError("the header lacks the stamp or two shapes, of a field two for each thread")
-    sizes = [math.prod(shape) for shape in header.shapes]
-    if len(packet.payload) != sum(sizes) * dtype.itemsize:
-        raise WireError(f"{len(packet.payload)} bytes for shapes {header.shapes} of {dtype}")
-    if header.threads and kind is not RidgeField:
-        raise WireError("the header names threads, which only fields have")
+    size = sum(map(math.prod, header.shapes)) * dtype.itemsize
+    if len(packet.payload) != size + sum(header.colours) * _COLOURED:
+        more = f" and {sum(header.colours)} colours" if header.colours else ""
+        raise WireError(f"{len(packet.payload)} bytes for shapes {header.shapes} of {dtype}{more}")
+    if (header.threads or header.colours) and kind is not RidgeField:
+        raise WireError("the header names threads or colours, which only fields have")
+    if len(header.colours) == 1:
+        raise WireError("the header counts the colours of one view, expected two or none")
     if len(set(header.threads)) < len(header.threads):
         raise WireError("the header names a thread twice")
-    data = np.frombuffer(bytes(packet.payload), dtype)
-    parts = np.split(data, np.cumsum(sizes)[:-1])
-    views = [p.reshape(s) for p, s in zip(parts, header.shapes, strict=True)]
-    stamp, pairs = Stamp(*header.stamp, header.period_ns), zip(views[::2], views[1::2], strict=True)
-    if not header.threads:
-        return kind(stamp, *next(pairs))
-    if any(view.shape != views[0].shape or view.shape[2:] != (2,) for view in views):
-        raise WireError(f"fields of shapes {header.shapes}, expected (H, W, 2) all alike")
-    return joined(stamp, dict(zip(header.threads, pairs, strict=True)))
+
+
+def _colours(payload: bytes, counts: list[int]) -> tuple[Colours, Colours] | None:
+    if not counts:
+        return None
+    total = sum(counts)
+    pixels = np.frombuffer(payload, _PLACE, 2 * total).reshape(-1, 2)
+    bgr = np.frombuffer(payload, np.uint8, offset=pixels.nbytes).reshape(-1, 3)
+    left, right = slice(counts[0]), slice(counts[0], None)
+    return Colours(pixels[left], bgr[left]), Colours(pixels[right], bgr[right])
 
 
 def _decode_small(packet: Packet, kind: type[Any]) -> Any:

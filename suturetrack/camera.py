@@ -9,12 +9,14 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from suturetrack.types import Float32, Float64, Image, InputError, Seed
+from suturetrack.types import Float32, Float64, Image, InputError, Seed, UInt16
 
 Pixels = TypeVar("Pixels", Image, Float32)
 
 LARGEST_SIDE = 8192
 """Of an image, px."""
+_LINE = 256
+"""Places that are looked up in one line of an image."""
 _LEAST_DISPARITY_PX = 2.0
 """Below it, a pixel more or less is half the depth."""
 
@@ -194,6 +196,19 @@ class StereoRig:
             for image, maps, buffer in zip((left, right), self._maps, out, strict=True)
         ]
         return rectified[0], rectified[1]
+
+    def rectified_at(self, image: Image, pixels: UInt16, *, right: bool = False) -> Image:
+        """(k, ...) what a raw image, (H, W, ...), shows at (k, 2) whole rectified pixels of its view."""
+        u, v = pixels.T
+        if self.is_rectified or not len(pixels):
+            flat = image.reshape(-1, *image.shape[2:])
+            return flat.take(v * np.intp(image.shape[1]) + u, axis=0)
+        places, fractions = (table[v, u] for table in self._maps[right])
+        # OpenCV takes no line of more than 32,767 places.
+        rows = -(-len(pixels) // _LINE)
+        table = np.resize(places, (rows, _LINE, 2)), np.resize(fractions, (rows, _LINE))
+        found = cv2.remap(image, *table, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+        return found.reshape(-1, *image.shape[2:])[: len(pixels)]
 
     def project(self, points: Float64) -> tuple[Float64, Float64]:
         """(..., 3) points in the rectified left frame -> (..., 2) rectified pixels, left and right."""

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
+UInt16 = NDArray[np.uint16]
 Bool = NDArray[np.bool_]
 
 
@@ -77,6 +79,27 @@ class StereoFrame:
 
 
 @dataclass(frozen=True, eq=False)
+class Colours:
+    """The colours of those pixels of a view that look like thread."""
+
+    pixels: UInt16
+    """(k, 2) rectified (u, v), row by row."""
+    bgr: Image
+    """(k, 3) of each."""
+
+    def reduced(self, scale: int) -> Colours:
+        """Those of every `scale`-th pixel, from the first, of a view that is reduced to them."""
+        kept = (self.pixels % scale == 0).all(1)
+        return Colours(self.pixels[kept] // np.uint16(scale), self.bgr[kept])
+
+    def raised(self, rows: int) -> Colours:
+        """Those of a view that is moved up by so many rows."""
+        moved = self.pixels - np.array([0, rows])
+        kept = moved[:, 1] >= 0
+        return Colours(moved[kept].astype(np.uint16), self.bgr[kept])
+
+
+@dataclass(frozen=True, eq=False)
 class RidgeField:
     """The segmented stereo pair, V_o of Algorithm 1, in rectified pixels.
 
@@ -92,11 +115,13 @@ class RidgeField:
     own: Mapping[str, tuple[Float32, Float32]] = field(default_factory=dict)
     """Of several threads, by name: left and right as they look for that thread alone. `left` and
     `right` then show all of them."""
+    colours: tuple[Colours, Colours] | None = None
+    """Of the left and the right view; None where the images are gray."""
 
     def of(self, thread: str) -> RidgeField:
         """Where to look for a thread: the field of its own, if there is one."""
         own = self.own.get(thread)
-        return self if own is None else RidgeField(self.stamp, *own)
+        return self if own is None else RidgeField(self.stamp, *own, colours=self.colours)
 
 
 @dataclass(frozen=True, eq=False)

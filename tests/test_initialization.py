@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from suturetrack.polylines import polyline_distances, polyline_length
 from suturetrack.segmentation import Segmenter
 from suturetrack.stage import Picture, Scene, open_scene
 from suturetrack.types import (
+    Colours,
     Float64,
     Image,
     InputError,
@@ -484,6 +486,65 @@ def test_a_thread_whose_end_lies_on_a_fainter_one_ends_there(seed: int, rig: str
     error = curve_error(dense(found.curve), scene.truth(0)[0].points)
     assert error.rms < 0.3
     assert max(error.ends) < 1
+
+
+def painted(strands: list[tuple[Float64, tuple[int, int, int]]], rig: StereoRig) -> RidgeField:
+    """The field of strands (k, 2) of some colours, the last one on top, at one depth, on gray ground."""
+    views = []
+    for shift in (0, 110):
+        channels = [np.full((480, 640), 190, np.uint8) for _ in range(3)]
+        for strand, colour in strands:
+            channels = [
+                draw(strand - [shift, 0], rig, channel, grey=grey)
+                for channel, grey in zip(channels, colour, strict=True)
+            ]
+        views.append(np.stack(channels, axis=2))
+    return field_of(views[0], views[1], rig)
+
+
+BLUE, BROWN = (130, 60, 60), (60, 60, 130)
+
+
+def test_a_thread_that_ends_on_one_of_another_colour_ends_there(rig: StereoRig) -> None:
+    """Without their colours, what goes on in its direction would be a part of it."""
+    t = np.linspace(0, 1, 400)
+    own = np.c_[180 + 180 * t, 240 + 20 * np.sin(3 * t)]
+    way = own[-1] - own[-2]
+    on = own[-1] + 170 * t[:, None] * way / np.linalg.norm(way) + np.c_[0 * t, -30 * t**2]
+    field = painted([(on, BROWN), (own, BLUE)], rig)
+    seed = Seed(pixel=tuple(own[100]))
+    found = initialize(field, rig, seed)
+    ends = rig.project(nurbs.evaluate(found.curve, np.array([0.0, 1.0])))[0]
+    assert np.linalg.norm(ends - own[-1], axis=1).min() < 2
+    assert found.confidence < 0.5
+    assert any("another colour" in reason for reason in found.reasons)
+    gray = initialize(replace(field, colours=None), rig, seed)
+    ends = rig.project(nurbs.evaluate(gray.curve, np.array([0.0, 1.0])))[0]
+    assert np.linalg.norm(ends - on[-1], axis=1).min() < 2
+
+
+def test_where_threads_touch_each_goes_on_in_its_own_colour(rig: StereoRig) -> None:
+    """By their shapes alone, both would cross."""
+    t = np.linspace(-1, 1, 600)
+    upper = np.c_[320 + 150 * t, 240 - 60 * np.abs(t) ** 1.3]
+    lower = np.c_[320 + 150 * t, 240 + 60 * np.abs(t) ** 1.3]
+    field = painted([(lower, BROWN), (upper, BLUE)], rig)
+    seed = Seed(pixel=tuple(upper[100]))
+    found = rig.project(dense(initialize(field, rig, seed).curve))[0]
+    assert polyline_distances(found, upper).max() < 2
+    gray = rig.project(dense(initialize(replace(field, colours=None), rig, seed).curve))[0]
+    assert polyline_distances(gray, upper).max() > 20
+
+
+def test_colours_are_known_of_views_that_are_reduced_or_raised() -> None:
+    pixels = np.array([[4, 0], [6, 2], [7, 2], [6, 3], [8, 6]], np.uint16)
+    colours = Colours(pixels, np.arange(15, dtype=np.uint8).reshape(5, 3))
+    reduced, raised = colours.reduced(2), colours.raised(2)
+    assert reduced.pixels.tolist() == [[2, 0], [3, 1], [4, 3]]
+    assert reduced.bgr[:, 0].tolist() == [0, 3, 12]
+    assert raised.pixels.tolist() == [[6, 0], [7, 0], [6, 1], [8, 4]]
+    assert raised.bgr[:, 0].tolist() == [3, 6, 9, 12]
+    assert raised.pixels.dtype == reduced.pixels.dtype == np.uint16
 
 
 def test_an_end_that_one_view_shows_further_on_is_doubted() -> None:

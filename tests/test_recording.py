@@ -31,6 +31,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Growth, Initialization, InitializationError, ViewGrowth
 from suturetrack.segmentation import joined
 from suturetrack.types import (
+    Colours,
     Energies,
     Nurbs,
     RidgeField,
@@ -88,7 +89,10 @@ def ridges(request: pytest.FixtureRequest) -> RidgeField:
     rng, own = np.random.default_rng(2), request.param
     views = rng.normal(0, 0.3, (1 + len(own), 2, 480, 640, 2)).astype(np.float32)
     if own:
-        return joined(STAMP, dict(zip(own, map(tuple, views[1:]), strict=True)))
+        of_each = dict(zip(own, map(tuple, views[1:]), strict=True))
+        pixels = np.array([[2, 0], [639, 0], [0, 479]], np.uint16)
+        left, right = (Colours(pixels[:k], rng.integers(0, 256, (k, 3), np.uint8)) for k in (3, 0))
+        return joined(STAMP, of_each, (left, right))
     return RidgeField(STAMP, *views[0])
 
 
@@ -115,6 +119,10 @@ def test_full_images_and_fields_come_back_to_the_bit_though_buffers_are_used_aga
     assert field.left.dtype == np.float32
     assert list(field.own) == list(ridges.own)
     assert np.array_equal([(field.left, field.right), *field.own.values()], fields)
+    assert (field.colours is None) == (ridges.colours is None)
+    for of_view, given in zip(field.colours or (), ridges.colours or (), strict=True):
+        assert np.array_equal(of_view.pixels, given.pixels)
+        assert np.array_equal(of_view.bgr, given.bgr)
 
 
 def test_light_images_are_close_and_in_the_right_colours(

@@ -166,6 +166,40 @@ def test_of_two_fields_the_longer_vectors_are_kept(seed: int, height: int, width
     np.testing.assert_array_equal(kept, twin)
 
 
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 12), st.floats(0.1, 2))
+def test_the_pixels_of_long_vectors_come_row_by_row(
+    seed: int, height: int, width: int, least: float
+) -> None:
+    # Whole 256ths: their squares are added without rounding, however the compiler does it.
+    vectors = np.random.default_rng(seed).integers(-256, 257, (height, width, 2)) / 256
+    vectors = vectors.astype(np.float32)
+    pixels = ridge.longer_than(least, vectors, np.empty(height * width, np.int32))
+    assert pixels.dtype == np.uint16
+    np.testing.assert_array_equal(pixels, reference.longer_than(least, vectors))
+
+
+def test_a_field_tells_the_colours_of_what_looks_like_thread(distorted_rig: StereoRig) -> None:
+    rng = np.random.default_rng(4)
+    images = [cv2.blur(rng.integers(0, 256, (480, 640, 3), np.uint8), (5, 5)) for _ in range(2)]
+    field = Segmenter(distorted_rig).step(StereoFrame(Stamp(0, 0, 0), *images))
+    rectified = distorted_rig.rectify(*images)
+    assert field.colours is not None
+    for view, image, colours in zip(
+        (field.left, field.right), rectified, field.colours, strict=True
+    ):
+        u, v = colours.pixels.T
+        shown = np.linalg.norm(view, axis=2) > 0.1
+        assert 1000 < len(u) == shown.sum()
+        assert shown[v, u].all()
+        np.testing.assert_array_equal(colours.bgr, image[v, u])
+
+
+def test_gray_images_have_no_colours(distorted_rig: StereoRig) -> None:
+    image = np.random.default_rng(5).integers(0, 256, (480, 640), np.uint8)
+    frame = StereoFrame(Stamp(0, 0, 0), image, image)
+    assert Segmenter(distorted_rig).step(frame).colours is None
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 64), st.floats(0.5, 0.999))
 def test_the_quantile_is_within_0_4_percent(
     seed: int, height: int, width: int, share: float

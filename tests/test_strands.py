@@ -57,11 +57,11 @@ def test_a_step_in_depth_makes_a_merge_dearer(
     left, right = two_views(arms, [DISPARITY, *(DISPARITY + s for s in steps)], rig)
     merges = Merges(np.array([[0, 2], [0, 4]]), np.array([0.3, 0.3]), np.zeros(2, bool))
     depth = Depth.around(np.full(10, DISPARITY), left, right)
-    cost = Arms(tuple(arms), {}, merges, depth).with_depth(merges).cost
+    cost = Arms(tuple(arms), {}, merges, depth, None).with_steps(merges).cost
     assert cost[dearer] > cost[1 - dearer] + 0.2
     assert cost[1 - dearer] == pytest.approx(0.3, abs=0.1)
     np.testing.assert_array_equal(
-        Arms(tuple(arms), {}, merges, None).with_depth(merges).cost, merges.cost
+        Arms(tuple(arms), {}, merges, None, None).with_steps(merges).cost, merges.cost
     )
 
 
@@ -69,13 +69,13 @@ def test_strands_that_cross_go_straight_on() -> None:
     run = np.arange(8.0, 69.0)
     ends = [np.c_[300 + way * run, 200 + side * 0.7 * run] for way in (-1, 1) for side in (-1, 1)]
     merges = Merges(np.empty((0, 2), np.int64), np.empty(0), np.empty(0, bool))
-    crossing_arms = Arms(tuple(ends), {}, merges, None)
+    crossing_arms = Arms(tuple(ends), {}, merges, None, None)
     straight, touching = [(0, 6), (2, 4)], [(0, 4), (2, 6)]
     change = crossing_arms.change(straight, touching)
     assert change is not None
     assert change > 0.2
     assert crossing_arms.change(touching, straight) == pytest.approx(-change)
-    short = Arms(tuple(e[:5] for e in ends), {}, merges, None)
+    short = Arms(tuple(e[:5] for e in ends), {}, merges, None, None)
     assert short.change(straight, touching) is None
 
 

@@ -30,6 +30,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.grasping import GraspPoint
 from suturetrack.segmentation import joined
 from suturetrack.types import (
+    Colours,
     Energies,
     Grasp,
     Nurbs,
@@ -78,6 +79,16 @@ def field(shape: tuple[int, ...] = (48, 64, 2), own: tuple[str, ...] = ()) -> Ri
     return RidgeField(STAMP, *views[0])
 
 
+def colours(*places: tuple[int, int]) -> Colours:
+    pixels = np.array(places, np.uint16).reshape(-1, 2)
+    return Colours(pixels, RNG.integers(0, 256, (len(pixels), 3), np.uint8))
+
+
+def coloured(*places: tuple[int, int], own: tuple[str, ...] = ()) -> RidgeField:
+    """A field with the colours of a pixel of the left view, and of these of the right one."""
+    return dataclasses.replace(field(own=own), colours=(colours((5, 7)), colours(*places)))
+
+
 LATENCY = Latency(1.0, 2.0, 3.0)
 HEALTH = Health("source", 1, STAMP, 30.0, LATENCY, 29.9, LATENCY, 600, 0, 1, 80.5)
 
@@ -86,6 +97,8 @@ MESSAGES: list[Any] = [
     frame((48, 64)),
     field(),
     field(own=("0", "left-hand")),
+    coloured((63, 0), (0, 1), (4, 1), (4, 47)),
+    coloured(own=("0", "left-hand")),
     state(),
     state(status=Status.LOST, curve=None, length=math.nan, energies=Energies(), events=("lost",)),
     state(sigma=np.array([0.1, np.inf]), seen=np.zeros(2, bool)),
@@ -226,6 +239,7 @@ def header_of(packet: Packet, **changes: Any) -> Packet:
         ({"stamp": [0.5, 0, 0]}, "stamp"),
         ({"publisher": "x" * 1000}, "publisher"),
         ({"threads": ["0"]}, "only fields"),
+        ({"colours": [0, 0]}, "only fields"),
     ],
 )
 def test_headers_that_lie_are_refused(changes: dict[str, Any], reason: str) -> None:
@@ -251,6 +265,19 @@ def test_headers_that_lie_of_single_threads_are_refused(
 ) -> None:
     packet = wire.encode(field(own=("0", "1")))
     refused(header_of(packet, **changes), RidgeField, reason)
+
+
+@pytest.mark.parametrize("counts", [[], [1, 1], [3], [1, 2, 3], [-1, 4], [2**62, 1], [2**63, 0]])
+def test_colours_that_do_not_fit_their_counts_are_refused(counts: list[int]) -> None:
+    packet = wire.encode(coloured((1, 1), (2, 2)))
+    refused(header_of(packet, colours=counts), RidgeField, "bytes for shapes|one view|colours")
+
+
+@pytest.mark.parametrize("places", [[(64, 0)], [(0, 48)], [(3, 2), (3, 2)], [(3, 2), (2, 2)]])
+def test_colours_outside_the_view_or_out_of_order_are_refused(
+    places: list[tuple[int, int]],
+) -> None:
+    refused(wire.encode(coloured(*places)), RidgeField, "outside the view|not in order")
 
 
 @dataclass(frozen=True)

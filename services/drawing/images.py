@@ -70,6 +70,8 @@ def field(field: RidgeField, rig: StereoRig, level: Level) -> Iterator[Entry]:
             if field.own:
                 own = np.stack([pair[side] for pair in field.own.values()])
                 numbers |= {"vectors": own, "threads": list(field.own)}
+            if field.colours is not None:
+                numbers |= vars(field.colours[side])
             yield f"/rig/{view}/field", values("RidgeField", numbers)
 
 

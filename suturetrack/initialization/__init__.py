@@ -65,7 +65,7 @@ def initialize(
         InitializationError: there is no thread at the seed, or none like it in the right view.
     """
     pixel = rig.locate(seed)
-    left = find_ridges(field.left, config)
+    left = _ridges_of(field, 0, config)
     scale = thread_scale(left, pixel)
     if scale == 1:
         found = _initialize(field, left, rig, pixel, config, 1)
@@ -82,9 +82,10 @@ def _initialize_from_afar(
         read_only(np.ascontiguousarray(view[::scale, ::scale]))
         for view in (field.left, field.right)
     )
-    reduced = RidgeField(field.stamp, left, right)
+    colours = field.colours and (field.colours[0].reduced(scale), field.colours[1].reduced(scale))
+    reduced = RidgeField(field.stamp, left, right, colours=colours)
     try:
-        ridges = find_ridges(reduced.left, config)
+        ridges = _ridges_of(reduced, 0, config)
         found = _initialize(reduced, ridges, rig.reduced(scale), pixel / scale, config, scale)
     except InitializationError as error:
         growth = None if error.growth is None else error.growth.enlarged(scale, field.left.shape)
@@ -131,7 +132,8 @@ def _initialize(
     found: Initialization | None = None
     with suppress(InitializationError):
         found = _reconstruct(start, field)
-    moved = RidgeField(field.stamp, field.left, raised(field.right, rows))
+    colours = field.colours and (field.colours[0], field.colours[1].raised(rows))
+    moved = RidgeField(field.stamp, field.left, raised(field.right, rows), colours=colours)
     try:
         other = _reconstruct(start, moved)
     except InitializationError:
@@ -143,6 +145,11 @@ def _initialize(
         return found
     total = rows + other.row_offset_px
     return replace(other, curve=_halfway(other.curve, rows, rig), row_offset_px=total)
+
+
+def _ridges_of(field: RidgeField, side: int, config: InitializationConfig) -> Ridges:
+    view = field.right if side else field.left
+    return find_ridges(view, config, field.colours and field.colours[side])
 
 
 def _halfway(curve: Nurbs, rows: float, rig: StereoRig) -> Nurbs:
@@ -171,7 +178,7 @@ class _Start:
 def _reconstruct(start: _Start, field: RidgeField) -> Initialization:
     """The curve of a thread of the left view."""
     rig, config, infinity = start.rig, start.config, start.rig.disparity_at_infinity
-    ridges = start.left, find_ridges(field.right, config)
+    ridges = start.left, _ridges_of(field, 1, config)
     found = find_thread(field, ridges, start.thread, start.pixel, infinity, config)
     step = max(1, round(config.step_px))
     marks = found.pixels[::step].reshape(-1, 2, 2)

@@ -1,4 +1,4 @@
-"""Whether two arms that meet at a crossing are one strand: as it bends, and as its depth changes."""
+"""Whether two arms that meet at a crossing are one strand: as it bends, and as depth and colour change."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
+from suturetrack.initialization.colours import Tints, difference
 from suturetrack.initialization.depth import Depth, Disparities
 from suturetrack.initialization.joints import Pair, inward
 from suturetrack.initialization.pricing import Merges
@@ -24,7 +25,8 @@ _RIVAL, _CLOSE_RIVAL = 0.5, 0.25
 """How much dearer a rival may be that counts, and one with which a segment may be shared."""
 ENERGY = 0.03
 """Price of a unit of the energy by which arms fit together less well."""
-_MOST_BENT = 25.0
+_MOST_BENT, _MOST_RECOLOURED = 25.0, 8.0
+"""Energy of a step at most: where two strands are on top of each other, both have the colour of one."""
 _LEAST_HIDDEN_ARM = 20
 _HIDDEN_PX = 30.0
 """Length of a hidden stretch that is worth a unit of energy."""
@@ -46,24 +48,27 @@ class Arms:
         partner: dict[int, int],
         merges: Merges | None,
         depth: Depth | None,
+        tints: Tints | None,
     ) -> None:
         self._segments, self._partner, self._depth = segments, partner, depth
+        self._tints = tints
         self._leads = {} if merges is None else _leads(merges)
         self._arms: dict[int, Float64] = {}
         self._disparities: dict[int, Disparities | None] = {}
+        self._colours: dict[int, Float64] = {}
 
     @cached_property
     def pieces(self) -> Arms:
         """The arms as far as the segments go by themselves, whoever may share them."""
-        return Arms(self._segments, {}, None, self._depth)
+        return Arms(self._segments, {}, None, self._depth, self._tints)
 
-    def with_depth(self, merges: Merges) -> Merges:
-        """The merges, those dearer whose arms differ in depth."""
+    def with_steps(self, merges: Merges) -> Merges:
+        """The merges, those dearer whose arms differ in depth or in colour."""
         cost = merges.cost.copy()
         for k in np.flatnonzero(cost < _LIKELY):
             i, j = merges.pairs[k].tolist()
             if min(self._lead(i), self._lead(j)) < _RIVAL:
-                cost[k] += ENERGY * self._step(i, j)
+                cost[k] += ENERGY * (self._step(i, j) + self._change_of_colour(i, j))
         return Merges(merges.pairs, cost, merges.touching)
 
     def change(self, pairs: list[Pair], others: list[Pair]) -> float | None:
@@ -89,7 +94,8 @@ class Arms:
         return _bend(one, other) + self._step(i, j) + (length / _HIDDEN_PX) ** 2
 
     def _misfit(self, i: int, j: int) -> float:
-        return ENERGY * (_bend(self._arm(i), self._arm(j)) + self._step(i, j))
+        bend = _bend(self._arm(i), self._arm(j))
+        return ENERGY * (bend + self._step(i, j) + self._change_of_colour(i, j))
 
     def _step(self, i: int, j: int) -> float:
         """Energy of a step in depth from one arm to the other."""
@@ -100,6 +106,15 @@ class Arms:
                 self._disparities[end] = self._depth.along(self._arm(end))
         one, other = self._disparities[i], self._disparities[j]
         return 0.0 if one is None or other is None else min(_step(one, other), _MOST_BENT)
+
+    def _change_of_colour(self, i: int, j: int) -> float:
+        """Energy of a step in colour from one arm to the other."""
+        if self._tints is None:
+            return 0.0
+        for end in (i, j):
+            if end not in self._colours:
+                self._colours[end] = self._tints.along(self._arm(end)[_SKIPPED:])
+        return min(difference(self._colours[i], self._colours[j]), _MOST_RECOLOURED)
 
     def _lead(self, end: int) -> float:
         return self._leads.get(end, np.inf)

@@ -14,6 +14,7 @@ from suturetrack.initialization.doubts import (
     FADES,
     FOREIGN,
     HIDDEN,
+    RECOLOURED,
     SHARED,
     SHARP,
     Doubt,
@@ -220,7 +221,7 @@ def _placed(
         both = max(rest, min(_same(why, there, doubts[1 - view]), default=1.0))
         if why == SHARED or not _is_shared(place, line, counterpart, chains[1 - view].pixels):
             left = rest
-        elif why in (BEYOND, CROSSING, FADES, *FOREIGN) and both < _GRAVE:
+        elif why in (BEYOND, CROSSING, FADES, RECOLOURED, *FOREIGN) and both < _GRAVE:
             left = both
         else:
             left = float(np.sqrt(rest))

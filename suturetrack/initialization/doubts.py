@@ -24,6 +24,7 @@ BENT = "a bend as of two strands"
 """Where the thread may end, and another one go on from there."""
 SHARP = "a sharp bend"
 FADES = "a fainter ridge behind an end"
+RECOLOURED = "a ridge of another colour behind an end"
 BEYOND = "a part beyond a gap that is longer"
 """Something else may lie where the thread would go on: of 208 threads found right none had such a part in
 both views."""

@@ -11,7 +11,7 @@ from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.matching import Match, match
 from suturetrack.initialization.segments import Ridges, nearest_segment
-from suturetrack.initialization.threads import Chain, Thread, follow_thread, without_faint_tails
+from suturetrack.initialization.threads import Chain, Thread, follow_thread, without_other_tails
 from suturetrack.polylines import coverage, nearest_index, polyline_distances
 from suturetrack.types import Float64, RidgeField
 
@@ -73,7 +73,7 @@ def find_thread(
     if len(apart):
         depth = Depth.around(apart, field.left, field.right)
         left = follow_thread(ridges[0], left.origin, config, depth)
-        left = without_faint_tails(left, seed)
+        left = without_other_tails(left, seed)
         matched = match(left.chain.pixels, field.left, field.right, at_infinity, 1)
     there = matched.pixels[nearest_index(left.chain.pixels, seed)]
     partner, _ = nearest_segment(ridges[1], there, np.inf)
@@ -85,7 +85,7 @@ def find_thread(
         config,
         Depth.around(-apart, field.right, field.left) if len(apart) else None,
     )
-    right = without_faint_tails(right, there)
+    right = without_other_tails(right, there)
     first = Hypothesis(left, right, matched)
     if _agreement(matched.pixels[matched.inside], right.chain.pixels) >= AGREED:
         return first

@@ -10,10 +10,11 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 from scipy.spatial import cKDTree
 
+from suturetrack.initialization.colours import Tints
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.kernels import crest, search
 from suturetrack.polylines import nearest_index, polyline_tangents, unit
-from suturetrack.types import Float32, Float64, Int64
+from suturetrack.types import Colours, Float32, Float64, Int64
 
 ARM = 14
 """Points of a segment that tell where it is heading."""
@@ -58,13 +59,17 @@ class Ridges:
     """Each (k, 2) pixels."""
     low: float
     """||V|| below which a pixel is background."""
+    tints: Tints | None = None
+    """None where the images are gray."""
 
     def sample(self, pixels: Float64) -> Float64:
         """(k,) ||V|| at (k, 2) pixels, bilinear, 0 outside."""
         return _bilinear(self.magnitude, pixels)
 
 
-def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
+def find_ridges(
+    field: Float32, config: InitializationConfig, colours: Colours | None = None
+) -> Ridges:
     """Crest lines of an (H, W, 2) field, split at junctions; weak and tiny ones are left out.
 
     A field of noise has none: thousands of them would keep whoever asks busy for minutes.
@@ -85,7 +90,8 @@ def find_ridges(field: Float32, config: InitializationConfig) -> Ridges:
         for a, b in pairwise(starts)
         if b - a >= _SHORTEST and (b - a >= ARM or strength[a:b].max() >= config.high)
     )
-    return Ridges(field, magnitude, split_at_touches(segments), low)
+    tints = None if colours is None else Tints.of(colours)
+    return Ridges(field, magnitude, split_at_touches(segments), low, tints)
 
 
 def nearest_segment(ridges: Ridges, seed: Float64, reach: float) -> tuple[int | None, Float64]:

@@ -11,9 +11,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
+from suturetrack.initialization.colours import another_begins
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
-from suturetrack.initialization.doubts import FADES, Doubt, doubts, joining
+from suturetrack.initialization.doubts import FADES, RECOLOURED, Doubt, doubts, joining
 from suturetrack.initialization.joints import Joints, inward
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
@@ -28,8 +29,9 @@ _FALL = 0.5
 """Ratio of the strengths behind and before such an end at most: threads fade more slowly."""
 _STEP, _LOWER = 0.7, 0.85
 """That ratio and that share where a strand that ends on the thread may be what goes on."""
-_FAINTER = 0.49
-"""What such an end leaves of the confidence."""
+_CUT = {FADES: 0.49, RECOLOURED: 0.2}
+"""What is left of the confidence in an end at which a vein goes on, or another thread: below that one it may
+lie hidden."""
 _SHORTEST_TAIL = 24
 """Points that go on so, at least: what is shorter may be the thread's own end, in the shade."""
 _AS_CLEAR = 0.6
@@ -137,46 +139,49 @@ def follow_thread(
     return Thread(ridges, joints, entries, origin, chain, np.empty((0, 2)))
 
 
-def without_faint_tails(thread: Thread, place: Float64) -> Thread:
-    """The thread through `place` (2,), cut where its strength falls at once and for good: it ends
-    there at a vein, or at another thread, that goes on in its direction."""
-    chain = thread.chain
-    strength = thread.ridges.sample(chain.pixels)
-    near = nearest_index(chain.pixels, place)
-    met = _strands_met(thread)
-    stop = _stops_at(strength, near, met)
-    last = len(strength) - 1
-    met = [(last - at, level) for at, level in met]
-    start = len(strength) - _stops_at(strength[::-1], last - near, met)
-    if stop - start == len(strength):
+def without_other_tails(thread: Thread, place: Float64) -> Thread:
+    """The thread through `place` (2,), cut where its strength falls, or its colour changes, at once and for
+    good: it ends there at a vein, or at another thread, that goes on in its direction."""
+    chain, pixels = thread.chain, thread.chain.pixels
+    near = nearest_index(pixels, place)
+    stop, why = _stops_at(thread, pixels, near)
+    behind_start, why_start = _stops_at(thread, pixels[::-1], len(pixels) - 1 - near)
+    start = len(pixels) - behind_start
+    if stop - start == len(pixels):
         return thread
-    pixels = chain.pixels[start:stop]
-    left = [d for d in chain.doubts if np.linalg.norm(pixels - d.place, axis=1).min() < _WINDOW]
-    cut = [end for end, at in ((0, start), (-1, len(strength) - stop)) if at > 0]
-    left += [Doubt(pixels[end], FADES, _FAINTER) for end in cut]
-    behind = np.concatenate([chain.pixels[:start], chain.pixels[stop:]])
-    return replace(thread, chain=Chain(pixels, tuple(left)), behind=behind)
+    kept = pixels[start:stop]
+    left = [d for d in chain.doubts if np.linalg.norm(kept - d.place, axis=1).min() < _WINDOW]
+    cut = [(0, why_start)] * (start > 0) + [(-1, why)] * (stop < len(pixels))
+    left += [Doubt(kept[end], kind, _CUT[kind]) for end, kind in cut]
+    behind = np.concatenate([pixels[:start], pixels[stop:]])
+    return replace(thread, chain=Chain(kept, tuple(left)), behind=behind)
 
 
-def _strands_met(thread: Thread) -> list[tuple[int, float]]:
-    """At which points of the chain other strands end, and how strong they are."""
-    joints, ridges, pixels = thread.joints, thread.ridges, thread.chain.pixels
-    arms = [inward(joints.segments, end) for end in joining(joints, thread.entries, ridges)]
-    return [(nearest_index(pixels, arm[0]), float(np.median(ridges.sample(arm)))) for arm in arms]
-
-
-def _stops_at(strength: Float64, first: int, met: list[tuple[int, float]]) -> int:
-    """Where behind the point `first` a vein, or a strand that the thread met before, goes on behind its end;
-    the length of the chain if nowhere."""
+def _stops_at(thread: Thread, pixels: Float64, first: int) -> tuple[int, str]:
+    """Where behind the point `first` of the chain (k, 2), taken either way, a vein or another thread goes
+    on behind the end, and what tells so; k if nowhere."""
+    ridges = thread.ridges
+    strength = ridges.sample(pixels)
     stops = [_falls_at(strength, first, _FALL, _FALLEN)]
     own = float(np.median(strength))
-    for at, level in met:
+    for place, level in _strands_met(thread):
+        at = nearest_index(pixels, place)
         if at > first:
             start = max(first, at - _WINDOW - _STEP_POINTS)
             # What goes on is that strand if it is more like that one than like the thread.
             fallen = min(_LOWER, float(np.sqrt(level / own)))
             stops.append(_falls_at(strength, start, _STEP, fallen))
-    return min(stops)
+    # The strength tells an end below another thread, too, the colour only where that begins to hide it.
+    if min(stops) < len(pixels) or ridges.tints is None:
+        return min(stops), FADES
+    return another_begins(ridges.tints.along(pixels), first), RECOLOURED
+
+
+def _strands_met(thread: Thread) -> list[tuple[Float64, float]]:
+    """Where other strands end on the thread, and how strong they are."""
+    joints, ridges = thread.joints, thread.ridges
+    arms = [inward(joints.segments, end) for end in joining(joints, thread.entries, ridges)]
+    return [(arm[0], float(np.median(ridges.sample(arm)))) for arm in arms]
 
 
 def _falls_at(strength: Float64, first: int, fall_to: float, fallen: float) -> int:

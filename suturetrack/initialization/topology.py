@@ -34,14 +34,14 @@ _FACING = 0.5
 def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None = None) -> Joints:
     """Pairs up the ends so that all merges and free ends together cost least (almost: by exchange).
 
-    With `depth`, ends whose arms differ in depth are dearer to join.
+    Ends whose arms differ in colour are dearer to join, and with `depth` those whose arms differ in that.
     """
     if not ridges.segments:
         return Joints([], {})
     merges = price_merges(ridges, config)
     first = _merge(ridges, merges, None)
-    arms = Arms(first.segments, first.partner, merges, depth)
-    return _merge(ridges, arms.with_depth(merges), arms)
+    arms = Arms(first.segments, first.partner, merges, depth, ridges.tints)
+    return _merge(ridges, arms.with_steps(merges), arms)
 
 
 def _merge(ridges: Ridges, merges: Merges, arms: Arms | None) -> Joints:

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from suturetrack.kernels import FAST
-from suturetrack.types import Float32, Image, Int64
+from suturetrack.types import Float32, Image, Int32, Int64, UInt16
 
 # As FAST, without licence to mix up +0 and -0.
 _exact = {"fastmath": {"contract"}, "error_model": "numpy"}
@@ -110,6 +110,22 @@ def keep_longer(vectors: Float32, out: Float32) -> None:
             is_longer = u * u + v * v > p * p + q * q
             kept[x, 0] = u if is_longer else p
             kept[x, 1] = v if is_longer else q
+
+
+@njit(cache=True, **FAST)
+def longer_than(least: float, vectors: Float32, places: Int32) -> UInt16:
+    """(k, 2) pixels (u, v), row by row, at which (H, W, 2) vectors are longer than that; (H * W,) is room."""
+    height, width, _ = vectors.shape
+    flat = vectors.reshape(height * width, 2)
+    squared, count = np.float32(least * least), 0
+    for i in range(len(flat)):
+        # Without a branch, this goes on however the vectors are.
+        places[count] = i
+        count += flat[i, 0] * flat[i, 0] + flat[i, 1] * flat[i, 1] > squared
+    pixels = np.empty((count, 2), np.uint16)
+    for k in range(count):
+        pixels[k, 0], pixels[k, 1] = places[k] % width, places[k] // width
+    return pixels
 
 
 @njit(cache=True, **FAST)

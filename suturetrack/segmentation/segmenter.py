@@ -9,12 +9,22 @@ import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import ridge, smears
+from suturetrack.segmentation.colours import Colouring
 from suturetrack.segmentation.config import SegmentationConfig
 from suturetrack.segmentation.contrast import SIGMAS, Contrast, contrast_along, contrast_at
 from suturetrack.segmentation.sight import SLOTS, Pair, Sight, first_look, learned_look
 from suturetrack.segmentation.silhouette import is_cut_out, silhouette_scale, silhouettes
 from suturetrack.segmentation.smear import Course
-from suturetrack.types import Float32, Float64, InputError, RidgeField, Seed, Stamp, StereoFrame
+from suturetrack.types import (
+    Colours,
+    Float32,
+    Float64,
+    InputError,
+    RidgeField,
+    Seed,
+    Stamp,
+    StereoFrame,
+)
 
 # Share of the way that a learned contrast goes at each step.
 _ADAPT = 0.2
@@ -51,6 +61,7 @@ class Segmenter:
         self._before: dict[str, tuple[Contrast, Contrast]] = {}
         """Of threads that are looked for from another seed: both contrasts, as they were before it."""
         self._first = Sight(rig, config, first_look(config))
+        self._colouring = Colouring(rig)
         self._all: Float32 | None = None
         self._steps = 0
         self._is_cut_out = False
@@ -95,10 +106,11 @@ class Segmenter:
             for name, thread in self._learned.items()
         }
         if len(own) > 1:
-            return joined(frame.stamp, own, self._room_for_all(slot))
-        return RidgeField(
-            frame.stamp, *(own.popitem()[1] if own else self._first.step(frame, slot))
-        )
+            field = joined(frame.stamp, own, out=self._room_for_all(slot))
+        else:
+            pair = own.popitem()[1] if own else self._first.step(frame, slot)
+            field = RidgeField(frame.stamp, *pair)
+        return replace(field, colours=self._colouring.of(frame, field.left, field.right))
 
     def learn(self, frame: StereoFrame, seed: Seed) -> None:
         """Learn at `seed` what tells its thread from the surroundings: colours, width, contrast.
@@ -194,8 +206,10 @@ class Segmenter:
         sight = Sight(self._rig, self._config, replace(self._first.look, relative=True))
         for shape in ((height, width, 3), (height, width)):
             black = np.zeros(shape, np.uint8)
-            field = sight.step(StereoFrame(Stamp(0, 0, 0), black, black), 0)
+            frame = StereoFrame(Stamp(0, 0, 0), black, black)
+            field = sight.step(frame, 0)
             ridge.keep_longer(field[0], field[1])
+            self._colouring.of(frame, *field)
         smears.keep_longer_of_half(field[0], black, 1.0, field[1])
 
     def _seen(self, frame: StereoFrame) -> StereoFrame:
@@ -217,12 +231,18 @@ class Segmenter:
         return left, right
 
 
-def joined(stamp: Stamp, own: Mapping[str, Pair], out: Pair | None = None) -> RidgeField:
+def joined(
+    stamp: Stamp,
+    own: Mapping[str, Pair],
+    colours: tuple[Colours, Colours] | None = None,
+    out: Pair | None = None,
+) -> RidgeField:
     """The field of several threads: at each pixel the longest of their vectors.
 
     Args:
         stamp: of the frame.
         own: by thread, left and right, (H, W, 2) float32 each.
+        colours: of the left and the right view.
         out: where to put left and right; without it, new arrays that nobody may write to.
     """
     first, *others = own.values()
@@ -232,4 +252,4 @@ def joined(stamp: Stamp, own: Mapping[str, Pair], out: Pair | None = None) -> Ri
         for other in others:
             ridge.keep_longer(other[side], longest)
         longest.flags.writeable = out is not None
-    return RidgeField(stamp, left, right, own)
+    return RidgeField(stamp, left, right, own, colours)

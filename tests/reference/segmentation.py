@@ -128,6 +128,12 @@ def fade_rims(plane, field, reach, faint=0.1, fades_from=0.55, gone_at=0.85):
     return kept[..., None] * field
 
 
+def longer_than(least, vectors):
+    """(k, 2) pixels (u, v), row by row, at which vectors are longer than that."""
+    v, u = np.nonzero(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 > np.float32(least * least))
+    return np.stack([u, v], axis=1)
+
+
 def keep_longer_of_half(half, mask, longest, field, fades_from=1.2, gone_at=1.8):
     """The field with the longer vectors of one of half the size, where the mask says so, and the mask."""
     out, left = field.copy(), mask.copy()
