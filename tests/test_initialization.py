@@ -377,9 +377,10 @@ def test_strands_that_share_a_stretch_may_be_exchanged(seed: int) -> None:
 
 
 def test_where_a_shared_stretch_leads_is_told_by_long_arms() -> None:
+    """Of gray images: the colours of these two threads would tell it at once."""
     scene = open_scene("two-threads", 303)
     field, start = field_and_seed(scene)
-    found = initialize(field, scene.rig, start)
+    found = initialize(replace(field, colours=None), scene.rig, start)
     assert curve_error(dense(found.curve), scene.truth(0)[0].points).rms < 0.3
     assert found.confidence > 0.5
     assert any("a stretch that two strands share" in reason for reason in found.reasons)

@@ -16,6 +16,8 @@ _DARK = 6.0
 """Grey levels by which darkness is lifted: its logarithm would be all noise."""
 _WITHIN = np.array([0.08, 0.08, 0.35])
 """By how much the tints of two arms of one thread differ (standard deviation)."""
+_COMMON = 5.0
+"""Energy that differences within one thread hardly exceed: up to there they say nothing."""
 _SHORTEST_ARM = 8
 """Points that tell the tint of an arm, at least."""
 _STEADY = np.array([0.04, 0.04, 0.15])
@@ -60,11 +62,13 @@ class Tints:
 
 
 def difference(one: Float64, other: Float64) -> float:
-    """Energy of the difference between the tints of two arms, (k, 3) and (m, 3); 0 where one is not known."""
+    """Energy of the difference between the tints of two arms, (k, 3) and (m, 3), beyond what is common in one
+    thread; 0 where one is not known."""
     if min(len(one), len(other)) < _SHORTEST_ARM:
         return 0.0
     step = (np.median(one, axis=0) - np.median(other, axis=0)) / _WITHIN
-    return 0.5 * float(step @ step) if np.isfinite(step).all() else 0.0
+    energy = 0.5 * float(step @ step) - _COMMON
+    return max(energy, 0.0) if np.isfinite(step).all() else 0.0
 
 
 def another_begins(tints: Float64, first: int) -> int:
