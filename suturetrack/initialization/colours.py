@@ -16,7 +16,7 @@ _DARK = 6.0
 """Grey levels by which darkness is lifted: its logarithm would be all noise."""
 _WITHIN = np.array([0.08, 0.08, 0.35])
 """By how much the tints of two arms of one thread differ (standard deviation)."""
-_COMMON = 5.0
+_COMMON = 8.0
 """Energy that differences within one thread hardly exceed: up to there they say nothing."""
 _SHORTEST_ARM = 8
 """Points that tell the tint of an arm, at least."""
