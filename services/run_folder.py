@@ -9,7 +9,7 @@ import tempfile
 import warnings
 import weakref
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
@@ -157,10 +157,13 @@ class RunFolder:
         """All fields of a full recording in order, each read when it is asked for."""
         for stamp, (left, left_colours), (right, right_colours) in self._pairs("field", _field):
             own = {name: (left[name], right[name]) for name in left if name}
-            field = joined(stamp, own) if own else RidgeField(stamp, left[""], right[""])
+            colours = None
             if left_colours is not None and right_colours is not None:
-                field = replace(field, colours=(left_colours, right_colours))
-            yield field
+                colours = left_colours, right_colours
+            if own:
+                yield joined(stamp, own, colours)
+            else:
+                yield RidgeField(stamp, left[""], right[""], colours=colours)
 
     def _parsed(self, rows: Iterable[Row], parse: Callable[[Row], T], what: str) -> list[T]:
         """The values in the rows; what a newer version wrote in another form is left out."""

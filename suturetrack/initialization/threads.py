@@ -143,28 +143,30 @@ def without_other_tails(thread: Thread, place: Float64) -> Thread:
     """The thread through `place` (2,), cut where its strength falls, or its colour changes, at once and for
     good: it ends there at a vein, or at another thread, that goes on in its direction."""
     chain, pixels = thread.chain, thread.chain.pixels
-    near = nearest_index(pixels, place)
-    stop, why = _stops_at(thread, pixels, near)
-    behind_start, why_start = _stops_at(thread, pixels[::-1], len(pixels) - 1 - near)
-    start = len(pixels) - behind_start
+    near, met = nearest_index(pixels, place), _strands_met(thread)
+    stop, why_stop = _stops_at(thread.ridges, pixels, near, met)
+    # The same from the other end.
+    count, why_start = _stops_at(thread.ridges, pixels[::-1], len(pixels) - 1 - near, met)
+    start = len(pixels) - count
     if stop - start == len(pixels):
         return thread
     kept = pixels[start:stop]
     left = [d for d in chain.doubts if np.linalg.norm(kept - d.place, axis=1).min() < _WINDOW]
-    cut = [(0, why_start)] * (start > 0) + [(-1, why)] * (stop < len(pixels))
+    cut = [(0, why_start)] * (start > 0) + [(-1, why_stop)] * (stop < len(pixels))
     left += [Doubt(kept[end], kind, _CUT[kind]) for end, kind in cut]
     behind = np.concatenate([pixels[:start], pixels[stop:]])
     return replace(thread, chain=Chain(kept, tuple(left)), behind=behind)
 
 
-def _stops_at(thread: Thread, pixels: Float64, first: int) -> tuple[int, str]:
-    """Where behind the point `first` of the chain (k, 2), taken either way, a vein or another thread goes
+def _stops_at(
+    ridges: Ridges, pixels: Float64, first: int, met: list[tuple[Float64, float]]
+) -> tuple[int, str]:
+    """Where behind the point `first` of a chain (k, 2) a vein, or a strand that the thread met before, goes
     on behind the end, and what tells so; k if nowhere."""
-    ridges = thread.ridges
     strength = ridges.sample(pixels)
     stops = [_falls_at(strength, first, _FALL, _FALLEN)]
     own = float(np.median(strength))
-    for place, level in _strands_met(thread):
+    for place, level in met:
         at = nearest_index(pixels, place)
         if at > first:
             start = max(first, at - _WINDOW - _STEP_POINTS)
