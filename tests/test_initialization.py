@@ -460,6 +460,25 @@ def test_a_seed_where_a_thread_crosses_itself_means_it(rig: StereoRig) -> None:
     assert not found.is_seed_shared
 
 
+@pytest.mark.parametrize(("grey", "is_shared"), [(60, True), (150, False)])
+def test_a_seed_between_two_veins_that_end_on_the_thread_means_the_thread(
+    rig: StereoRig, grey: int, is_shared: bool
+) -> None:
+    """Where they are as clear as the thread they may be one strand, which shares a stretch with it."""
+    t = np.linspace(0, 1, 500)
+    thread = np.c_[180 + 320 * t, 240 + 30 * np.sin(4 * t)]
+    first, last = thread[190], thread[310]
+    come, go = first + np.c_[-110 * t, 45 * t**1.5], last + np.c_[110 * t, 45 * t**1.5]
+    views = []
+    for shift in ([0, 0], [110, 0]):
+        view = None
+        for vein in (come, go):
+            view = draw(vein - shift, rig, view, grey=grey)
+        views.append(draw(thread - shift, rig, view, grey=60))
+    found = initialize(field_of(views[0], views[1], rig), rig, Seed(pixel=tuple(thread[250])))
+    assert found.is_seed_shared == is_shared
+
+
 @pytest.mark.parametrize("is_joined", [True, False])
 def test_a_thread_that_may_have_run_into_another_one_is_doubtful(
     rig: StereoRig, is_joined: bool
@@ -522,6 +541,21 @@ def test_a_thread_that_ends_on_one_of_another_colour_ends_there(rig: StereoRig) 
     gray = initialize(replace(field, colours=None), rig, seed)
     ends = rig.project(nurbs.evaluate(gray.curve, np.array([0.0, 1.0])))[0]
     assert np.linalg.norm(ends - on[-1], axis=1).min() < 2
+
+
+def test_a_strand_of_another_colour_that_ends_on_a_thread_does_not_go_on_in_it(
+    rig: StereoRig,
+) -> None:
+    """Without their colours, either of the two that come may be the one that goes on."""
+    t = np.linspace(0, 1, 500)
+    straight = np.c_[np.full(500, 330.0), 60 + 360 * t]
+    aside = np.c_[335 + 80 * t**1.5, 250 - 150 * t]
+    field = painted([(aside, BROWN), (straight, BLUE)], rig)
+    seed = Seed(pixel=(330.0, 120.0))
+    for colours, is_doubtful in ((field.colours, False), (None, True)):
+        found = initialize(replace(field, colours=colours), rig, seed)
+        assert (found.confidence < 0.5) == is_doubtful
+        assert any("another strand that ends on it" in r for r in found.reasons) == is_doubtful
 
 
 def test_where_threads_touch_each_goes_on_in_its_own_colour(rig: StereoRig) -> None:

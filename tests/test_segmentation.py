@@ -703,6 +703,31 @@ def test_a_highlight_is_not_dark_where_the_thread_is(number: int) -> None:
     assert np.quantile(shown[is_white], 0.9) < 0.25 * np.median(shown[v, u])
 
 
+@pytest.mark.parametrize("number", range(4))
+def test_a_black_thread_is_seen_whose_rims_a_lens_colours(number: int) -> None:
+    """Its channels are a pixel apart, as at the edge of a lens: one rim is bluish, one reddish, and both are
+    less like the tissue than the thread itself.
+    """
+    rng = np.random.default_rng(number)
+    angle, along = rng.uniform(0, np.pi), np.linspace(-150, 150, 301)[:, None]
+    towards = np.array([np.cos(angle), np.sin(angle)])
+    v, u = np.mgrid[:400, :400] - 200.0
+    ground = 120 + 24 * 12 * cv2.GaussianBlur(rng.normal(size=(400, 400)), (0, 0), 12)
+    planes = []
+    for shift in (1.0, 0.0, -1.0):
+        distance = np.abs(u * -towards[1] + v * towards[0] - shift)
+        share = expit(-2 * (distance - 2))
+        planes.append(ground * (1 - share) + 15 * share)
+    noisy = np.stack(planes, axis=2) + rng.normal(0, 1.5, (400, 400, 1))
+    image = np.clip(noisy + rng.normal(0, 0.4, (400, 400, 3)), 0, 255).astype(np.uint8)
+    frame, segmenter = StereoFrame(STAMP, image, image), Segmenter(small_rig(400, 400))
+    segmenter.learn(frame, Seed(pixel=(201.0, 199.0)))
+    assert segmenter.threads == ("0",)
+    field, pixels = segmenter.step(frame).left, 200 + along * towards
+    assert np.mean(centre_errors(field, pixels)) < 0.75
+    assert np.quantile(on_thread(field, pixels), 0.05) > 0.5
+
+
 @pytest.mark.parametrize("light", [(1.6, 1.0, 0.45), (0.55, 0.8, 1.15), (0.4, 0.4, 0.4)])
 def test_another_exposure_and_white_balance_show_the_same(
     scene: Scene, light: tuple[float, float, float]

@@ -9,9 +9,11 @@ from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from suturetrack.initialization.arms import ENERGY
+from suturetrack.initialization.colours import Tints, difference
 from suturetrack.initialization.joints import Joints, inward
 from suturetrack.initialization.pricing import FREE_END, HIGHEST, TOUCHING_PX
 from suturetrack.initialization.segments import ARM, Ridges, chain_tangents
+from suturetrack.polylines import nearest_index
 from suturetrack.types import Float64
 
 CROSSING = "an ambiguous crossing"
@@ -57,8 +59,9 @@ _JOINS_PX = 8.0
 _CLEAR, _LEAVES_PX = 0.4, 15.0
 """Strength of such a strand, against the thread's on the weaker side, and how far it comes from, at
 least: another thread may have another colour, and a shadow has a quarter of the strength."""
-_SIDE = 40
-"""Points of the thread on each side of a place whose strength counts there."""
+_SIDE, _AT = 40, 4
+"""Points of the thread on each side of a place whose strength and colour count there, and those at the place
+that have the colour of both strands."""
 
 
 class Doubt(NamedTuple):
@@ -78,7 +81,7 @@ def doubts(joints: Joints, entries: list[int], ridges: Ridges) -> list[Doubt]:
         Doubt(inward(joints.segments, end)[0], why, rest)
         for end, why, rest in (
             *_at_merges(joints, entries),
-            *((end, JOINED, _FOREIGN) for end in joining(joints, entries, ridges)),
+            *((end, JOINED, _FOREIGN) for end in _mistakable(joints, entries, ridges)),
             *_at_tips(joints, entries, ridges),
         )
     ]
@@ -118,6 +121,25 @@ def _lead(joints: Joints, entry: int, entries: list[int], within: dict[int, list
         and not (joints.original(rival) == joints.original(partner) and rival // 2 in on_thread)
     ]
     return max(min(added, default=1.0), 0.0)
+
+
+def _mistakable(joints: Joints, entries: list[int], ridges: Ridges) -> list[int]:
+    """The free ends of strands that run into the side of the thread and may be what goes on there."""
+    line = np.concatenate([inward(joints.segments, entry) for entry in entries])
+    return [
+        end
+        for end in joining(joints, entries, ridges)
+        if ridges.tints is None or not _differs(inward(joints.segments, end), line, ridges.tints)
+    ]
+
+
+def _differs(strand: Float64, line: Float64, tints: Tints) -> bool:
+    """Whether a strand, (k, 2) from its end on, differs in colour from both sides of the thread (m, 2) there,
+    which are alike."""
+    at = nearest_index(line, strand[0])
+    sides = line[max(at - _SIDE, 0) : max(at - _AT, 0)], line[at + _AT : at + _SIDE]
+    before, after, other = (tints.along(p) for p in (*sides, strand[_AT:_SIDE]))
+    return difference(before, after) == 0 < min(difference(before, other), difference(after, other))
 
 
 def joining(joints: Joints, entries: list[int], ridges: Ridges) -> list[int]:

@@ -105,21 +105,36 @@ class Thread:
         """Whether another strand that leads away runs as near by a pixel (2,) as the thread itself."""
         pixels, segments = self.chain.pixels, self.ridges.segments
         reach = np.linalg.norm(pixels - place, axis=1).min() + _MEETS_PX
+        own = {self.joints.original(entry) // 2 for entry in self.entries}
+        level = _AS_CLEAR * self._strength
         for k in self._others(_AS_CLEAR):
             if np.linalg.norm(segments[k] - place, axis=1).min() > reach + _BRIDGED_PX:
                 continue
             entries = self.joints.follow(k)
-            strand = _join([inward(segments, entry) for entry in entries])
+            pieces = [inward(segments, entry) for entry in entries]
+            # What it shares with the thread is as clear as that.
+            alone = [
+                piece
+                for piece, entry in zip(pieces, entries, strict=True)
+                if self.joints.original(entry) // 2 not in own
+            ]
+            if not alone or np.median(self.ridges.sample(np.concatenate(alone))) <= level:
+                continue
+            strand = _join(pieces)
             away = np.linalg.norm(strand - place, axis=1)
             around = strand[away < _AROUND_PX]
             if away.min() < reach and polyline_distances(around, pixels).max() > _LEAVES_PX:
                 return True
         return False
 
+    @property
+    def _strength(self) -> float:
+        return float(np.median(self.ridges.sample(self.chain.pixels)))
+
     def _others(self, strength: float) -> list[int]:
         """The segments that are no part of the thread, and have that share of its strength."""
         own, ridges = {e // 2 for e in self.entries}, self.ridges
-        level = strength * float(np.median(ridges.sample(self.chain.pixels)))
+        level = strength * self._strength
         return [
             k
             for k, segment in enumerate(ridges.segments)

@@ -50,6 +50,8 @@ _SHADOW = 0.05
 _CLEAR = 0.7
 # Of the scale that responds most, the share at which the middle is seen best.
 _BELOW = 0.8
+# Places beside a ridge, against the scale, at which its rims are.
+_BESIDE = (-3, -2.5, -2, -1.5, 1.5, 2, 2.5, 3)
 # A mix that is not better than gray by this factor is not worth its noise.
 _WORTH = 1.1
 # What of its distinctness a thread keeps, at least, in a mix that is blind to highlights: white ones do not.
@@ -281,6 +283,28 @@ def _window(image: Image, pixel: Float64, half: int = _WINDOW_PX) -> tuple[Image
 
 def _starts(scene: _Scene, seed: Float64, reach: float) -> list[tuple[int, int]]:
     """(v, u) of pixels near the seed whose second derivatives are least like the nuisance."""
+    v, u = _pixels_near(scene, seed, reach)
+    unlike = _most_unlike(scene, v, u)[0]
+    unlike *= _nearness(np.stack([u, v], axis=1), seed, reach) ** 2
+    return [(int(v[i]), int(u[i])) for i in _peaks(unlike, v, u)]
+
+
+def _clearest_in_gray(
+    scene: _Scene, seed: Float64, reach: float
+) -> tuple[tuple[int, int], Float64]:
+    """(v, u) of the pixel near the seed whose second derivative is largest in gray, and the (channels,) mix
+    in which it is dark."""
+    v, u = _pixels_near(scene, seed, reach)
+    gray = GRAY if scene.hessian.shape[-1] > 1 else np.ones(1)
+    uu, uv, vv = scene.hessian[:, v, u] @ gray
+    root = np.sqrt((uu - vv) ** 2 + 4 * uv**2)
+    across = (uu + vv + np.where(uu + vv < 0, -root, root)) / 2
+    best = int(np.argmax(abs(across) * _nearness(np.stack([u, v], axis=1), seed, reach)))
+    return (int(v[best]), int(u[best])), gray * np.sign(across[best])
+
+
+def _pixels_near(scene: _Scene, seed: Float64, reach: float) -> tuple[Int64, Int64]:
+    """v and u, (N,) each, of the pixels up to a distance from the seed."""
     height, width = scene.hessian.shape[1:3]
     whole = math.ceil(reach)
     v, u = (
@@ -289,10 +313,7 @@ def _starts(scene: _Scene, seed: Float64, reach: float) -> list[tuple[int, int]]
     )
     near = (np.hypot(u - seed[0], v - seed[1]) <= reach) & (u >= 0) & (v >= 0)
     near &= (u < width) & (v < height)
-    v, u = v[near], u[near]
-    unlike = _most_unlike(scene, v, u)[0]
-    unlike *= _nearness(np.stack([u, v], axis=1), seed, reach) ** 2
-    return [(int(v[i]), int(u[i])) for i in _peaks(unlike, v, u)]
+    return v[near], u[near]
 
 
 def _nearness(pixels: Float64, seed: Float64, reach: float) -> Float64:
@@ -326,22 +347,23 @@ def _ridges_near(scene: _Scene, seed: Float64, reach: float) -> list[tuple[Float
     for start in _starts(scene, seed, reach):
         offsets = [ridge.pixels - start[::-1] for _, ridge in ridges]
         if not any((np.abs(offset).max(1) <= 1).any() for offset in offsets):
-            followed = _follow(scene, start)
-            if followed is not None:
-                ridges.append(followed)
-    return ridges
+            weights = _fisher(scene.nuisance, _most_unlike(scene, *np.array(start)[:, None])[1])
+            ridges += _followed(scene, start, weights)
+    # The edges of a lens colour the rims of a black thread, which are least like the nuisance then.
+    return ridges + _followed(scene, *_clearest_in_gray(scene, seed, reach))
 
 
-def _follow(scene: _Scene, start: tuple[int, int]) -> tuple[Float64, _Ridge] | None:
-    """The mix that suits the ridge through `start`, and the ridge as that mix shows it."""
-    weights = _fisher(scene.nuisance, _most_unlike(scene, *np.array(start)[:, None])[1])
+def _followed(
+    scene: _Scene, start: tuple[int, int], weights: Float64
+) -> list[tuple[Float64, _Ridge]]:
+    """The mix that suits the ridge that a first mix shows at `start`, and the ridge in it, if any."""
     ridge = _dark_ridge(scene, weights, start)
     for _ in range(_ROUNDS):
         if ridge is None:
-            return None
+            return []
         weights = _fisher(scene.nuisance, ridge.across(scene))
         ridge = _dark_ridge(scene, weights, start)
-    return None if ridge is None else (weights, ridge)
+    return [] if ridge is None else [(weights, ridge)]
 
 
 def _fisher(nuisance: Float64, across: Float64) -> Float64:
@@ -351,11 +373,15 @@ def _fisher(nuisance: Float64, across: Float64) -> Float64:
 
 
 def _score(scene: _Scene, weights: Float64, ridge: _Ridge, covariance: Float64) -> float:
-    """How far the ridge stands out; not above 0 for the rim of a stronger ridge of other sign."""
-    middle = float(np.median(ridge.across(scene) @ weights))
-    offsets = scene.sigma * np.array([-3, -2.5, -2, -1.5, 1.5, 2, 2.5, 3])
-    rim = max(-float(np.median(ridge.across(scene, k) @ weights)) for k in offsets)
-    return (middle - max(rim, 0.0)) / max(math.sqrt(weights @ covariance @ weights), 1e-9)
+    """How far the ridge stands out; not above 0 for the rim of a stronger ridge of other sign, and less for
+    the coloured rim of one that is stronger in other mixes."""
+    middle = np.median(ridge.across(scene), axis=0)
+    beside = [np.median(ridge.across(scene, scene.sigma * k), axis=0) for k in _BESIDE]
+    rim = max(-float(b @ weights) for b in beside)
+    stronger = max(float(np.linalg.norm(b)) for b in (middle, *beside))
+    share = float(np.linalg.norm(middle)) / max(stronger, 1e-9)
+    spread = max(math.sqrt(weights @ covariance @ weights), 1e-9)
+    return share * (float(middle @ weights) - max(rim, 0.0)) / spread
 
 
 def _of_one_thread(scene: _Scene, ridge: _Ridge, seed: Float64) -> Float64:
