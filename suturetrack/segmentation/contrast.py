@@ -54,6 +54,8 @@ _BELOW = 0.8
 _BESIDE = (-3, -2.5, -2, -1.5, 1.5, 2, 2.5, 3)
 # A mix that is not better than gray by this factor is not worth its noise.
 _WORTH = 1.1
+# And a ridge in gray not worth another one that stands out less by this factor.
+_BETTER = 1.04
 # What of its distinctness a thread keeps, at least, in a mix that is blind to highlights: white ones do not.
 _KEPT = 0.667
 # A highlight's second derivative is about a third of what it differs from the ground; below 0.4 of the
@@ -191,15 +193,18 @@ def _shown(image: Image, pixel: Float64, octave: int) -> _Shown | None:
     crop, seed = _window(*_shrunk(image, pixel, octave))
     scene = _Scene.of(crop, SIGMAS[0])
     reach = max(_SNAP_PX / 2**octave, _LEAST_SNAP_PX)
-    ridges = _ridges_near(scene, seed, reach)
-    if not ridges:
-        return None
 
     def standing(weights: Float64, ridge: _Ridge) -> float:
         near = float(_nearness(ridge.pixels, seed, reach).max())
         return near * _score(scene, weights, ridge, scene.nuisance)
 
-    weights, ridge = max(ridges, key=lambda r: standing(*r))
+    ridges = [(standing(*ridge), *ridge) for ridge in _ridges_near(scene, seed, reach)]
+    # A lens colours the rims of a black thread, which are less like the nuisance than itself.
+    in_gray = _followed(scene, *_clearest_in_gray(scene, seed, reach))
+    ridges += [(standing(*ridge) / _BETTER, *ridge) for ridge in in_gray]
+    if not ridges:
+        return None
+    _, weights, ridge = max(ridges, key=lambda r: r[0])
     response = float(np.linalg.norm(np.median(ridge.across(scene), axis=0)))
     score = _score(scene, weights, ridge, scene.clutter)
     return _Shown(octave, _Ridge(ridge.pixels - seed, ridge.normals), score, response)
@@ -349,8 +354,7 @@ def _ridges_near(scene: _Scene, seed: Float64, reach: float) -> list[tuple[Float
         if not any((np.abs(offset).max(1) <= 1).any() for offset in offsets):
             weights = _fisher(scene.nuisance, _most_unlike(scene, *np.array(start)[:, None])[1])
             ridges += _followed(scene, start, weights)
-    # The edges of a lens colour the rims of a black thread, which are least like the nuisance then.
-    return ridges + _followed(scene, *_clearest_in_gray(scene, seed, reach))
+    return ridges
 
 
 def _followed(
