@@ -105,27 +105,32 @@ class Thread:
         """Whether another strand that leads away runs as near by a pixel (2,) as the thread itself."""
         pixels, segments = self.chain.pixels, self.ridges.segments
         reach = np.linalg.norm(pixels - place, axis=1).min() + _MEETS_PX
-        own = {self.joints.original(entry) // 2 for entry in self.entries}
-        level = _AS_CLEAR * self._strength
         for k in self._others(_AS_CLEAR):
             if np.linalg.norm(segments[k] - place, axis=1).min() > reach + _BRIDGED_PX:
                 continue
             entries = self.joints.follow(k)
-            pieces = [inward(segments, entry) for entry in entries]
-            # What it shares with the thread is as clear as that.
-            alone = [
-                piece
-                for piece, entry in zip(pieces, entries, strict=True)
-                if self.joints.original(entry) // 2 not in own
-            ]
-            if not alone or np.median(self.ridges.sample(np.concatenate(alone))) <= level:
+            if not self._is_as_clear(entries):
                 continue
-            strand = _join(pieces)
+            strand = _join([inward(segments, entry) for entry in entries])
             away = np.linalg.norm(strand - place, axis=1)
             around = strand[away < _AROUND_PX]
             if away.min() < reach and polyline_distances(around, pixels).max() > _LEAVES_PX:
                 return True
         return False
+
+    def _is_as_clear(self, entries: list[int]) -> bool:
+        """Whether a strand that enters its segments there is as clear as the thread where it runs alone."""
+        own = {self.joints.original(entry) // 2 for entry in self.entries}
+        alone = [
+            self.ridges.segments[entry // 2]
+            for entry in entries
+            if self.joints.original(entry) // 2 not in own
+        ]
+        if not alone:
+            return False
+        return bool(
+            np.median(self.ridges.sample(np.concatenate(alone))) > _AS_CLEAR * self._strength
+        )
 
     @property
     def _strength(self) -> float:

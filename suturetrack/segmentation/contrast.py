@@ -54,7 +54,7 @@ _BELOW = 0.8
 _BESIDE = (-3, -2.5, -2, -1.5, 1.5, 2, 2.5, 3)
 # A mix that is not better than gray by this factor is not worth its noise.
 _WORTH = 1.1
-# And a ridge in gray not worth another one that stands out less by this factor.
+# A ridge found in gray that is not better than one of another mix by this factor is not taken for it.
 _BETTER = 1.04
 # What of its distinctness a thread keeps, at least, in a mix that is blind to highlights: white ones do not.
 _KEPT = 0.667
