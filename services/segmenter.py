@@ -26,8 +26,6 @@ from suturetrack.types import (
     StereoFrame,
 )
 
-_RECENT_FRAMES = 3
-"""Frames in which a thread hardly moves."""
 _SEEN = 0.5
 """Share of a curve that must be seen to tell the thread's colour."""
 
@@ -82,8 +80,8 @@ def run(service: Service, config: SegmenterConfig) -> None:
             continue
         while given:
             learn(given.pop(0), frame)
-        for place in held.seeds(frame.stamp) if held is not None else ():
-            learn(place, frame)
+        for place, shown in held.seeds(frame) if held is not None else ():
+            learn(place, shown)
         while (drop := drops.get(0)) is not None:
             segmenter.forget(drop.thread)
             recorder.request(frame.stamp, drop)
@@ -104,20 +102,33 @@ class _Held:
     def __init__(self, bus: Bus, rig: StereoRig):
         self._states = bus.every(topics.STATE)
         self._rig = rig
+        self._shown: StereoFrame | None = None
+        """A frame whose states are awaited, however late they are."""
         self.threads = {s.thread for s in bus.last(topics.STATE) if s.curve is not None}
         """Names of those of which nothing was learned yet."""
 
-    def seeds(self, now: Stamp) -> Iterator[Seed]:
-        """A place on every further thread that was seen a moment ago.
+    def seeds(self, frame: StereoFrame) -> Iterator[tuple[Seed, StereoFrame]]:
+        """A place on every further thread that was seen, and the frame in which it was.
 
         Without its colour the tracker may hold a thread and yet not be sure of it.
+
+        Args:
+            frame: the next one, to be kept where none is or where the tracker has gone past it.
         """
+        shown = self._shown
+        is_past = shown is None
         while (state := self._states.get(0)) is not None:
-            recent = now.frame - state.stamp.frame <= _RECENT_FRAMES
+            if shown is None or state.stamp.released_ns < shown.stamp.released_ns:
+                continue
+            if state.thread not in self.threads:
+                continue
+            is_past = True
             is_seen = state.status is not Status.LOST and np.mean(state.seen) > _SEEN
-            if recent and is_seen and state.thread in self.threads:
+            if state.stamp == shown.stamp and is_seen:
                 self.threads.remove(state.thread)
-                yield seed_on(scaled(state, 1 / self._rig.metres_per_unit))
+                yield seed_on(scaled(state, 1 / self._rig.metres_per_unit)), shown
+        if is_past:
+            self._shown = frame if self.threads else None
 
 
 def warm_up(rig: StereoRig, config: SegmenterConfig) -> RidgeField:

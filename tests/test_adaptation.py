@@ -200,6 +200,7 @@ def test_lock_step_adapts_the_same_twice_to_the_bit(monkeypatch: pytest.MonkeyPa
     assert states[0] == states[1]
 
 
+@pytest.mark.parametrize("late", [0, 9])
 @pytest.mark.parametrize(
     ("status", "seen", "learns"),
     [
@@ -210,9 +211,10 @@ def test_lock_step_adapts_the_same_twice_to_the_bit(monkeypatch: pytest.MonkeyPa
     ],
 )
 def test_a_segmenter_that_is_started_again_learns_from_what_is_seen_of_a_thread(
-    scenes: tuple[Scene, Scene], status: Status, seen: bool, learns: bool
+    scenes: tuple[Scene, Scene], status: Status, seen: bool, late: int, learns: bool
 ) -> None:
-    """Of a thread of which nobody is sure, too: without its colour nobody may ever be."""
+    """Of a thread of which nobody is sure, too: without its colour nobody may ever be; and so many frames
+    later, as where the tracker is slow."""
     desk, rig, config = Desk(scenes), Rig(), ServiceConfig(resume=1)
     camera, tracker = rig.connect("source"), rig.connect("tracker")
     camera.answer(topics.CALIBRATION, lambda _: desk.rig)
@@ -225,15 +227,18 @@ def test_a_segmenter_that_is_started_again_learns_from_what_is_seen_of_a_thread(
     rig.start("segmenter", segmenter, SegmenterConfig(config))
     assert camera.wait_for_alive("segmenter", 60)
     shown = []
-    for index in range(2):
-        camera.publish(topics.FRAME, StereoFrame(Stamp(index, 0, 0), *desk.images))
+    for index in range(late + 2):
+        camera.publish(topics.FRAME, StereoFrame(Stamp(index, 0, index), *desk.images))
         field = fields.get(20)
         assert field is not None
         shown.append(field.left.tobytes())
-        tracker.publish(topics.STATE, replace(message, stamp=Stamp(index, 0, 0)))
+        if index >= late:
+            seen_at = Stamp(index - late, 0, index - late)
+            tracker.publish(topics.STATE, replace(message, stamp=seen_at))
     rig.stop()
     assert not rig.errors
-    assert (shown[0] != shown[1]) is learns
+    assert len(set(shown[:-1])) == 1
+    assert (shown[-2] != shown[-1]) is learns
 
 
 @pytest.mark.parametrize("is_late", [True, False])
