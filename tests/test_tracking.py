@@ -539,6 +539,27 @@ def test_what_a_tool_has_swept_over_is_taken_up_as_a_whole(rig: StereoRig) -> No
     assert error(states[-1], truths[-1]).rms < 0.15
 
 
+@pytest.mark.parametrize("speed_px", [1.2, 2.0])
+def test_an_end_that_shows_again_beyond_what_covered_it_is_taken_up(
+    rig: StereoRig, speed_px: float
+) -> None:
+    """What moves over an end little by little seems to draw it back."""
+    radius_px, mm = 20.0, 200.0 / rig.focal
+    fields, truths = [], [thread(0.3 * np.sin(i / 40)) for i in range(130)]
+    for i, points in enumerate(truths):
+        covered = mm * min(max(speed_px * (i - 25), 0.0) - radius_px - 4.0, 120.0)
+        ahead = points[-1] - points[-31]
+        beyond = points[-1] - covered * ahead / np.linalg.norm(ahead)
+        place = beyond if covered < 0 else points[round(599 - 6 * covered)]
+        u, v = rig.project(place)[0]
+        fields.append(paint(rig, [points], i, [(float(u), float(v), radius_px)]))
+    states = follow(fields, rig, seed_on(rig, truths[0]))
+    assert min(state.length for state in states) < 90.0
+    assert all(state.status is Status.TRACKING for state in states[-10:])
+    assert error(states[-1], truths[-1]).rms < 0.2
+    assert max(error(states[-1], truths[-1]).ends) < 1.0
+
+
 def test_an_end_that_was_given_up_may_come_back(rig: StereoRig) -> None:
     """What is left was taken for the whole thread by then, and is longer again."""
     hidden = range(30, 100)
@@ -734,17 +755,24 @@ def test_a_tip_that_one_view_alone_shows_is_cut_off_if_it_is_short(rig: StereoRi
         assert nurbs.length(left) < nurbs.length(curve) - 4.0 if is_cut else left is fit.curve
 
 
-def test_what_was_lost_is_not_held_again_while_a_part_of_it_is_hidden(rig: StereoRig) -> None:
+@pytest.mark.parametrize(
+    ("hidden", "is_held"),
+    [(slice(240, 330), True), (slice(480, 601), False), (slice(160, 400), False)],
+)
+def test_what_was_lost_is_held_again_where_little_is_hidden_between_its_ends(
+    rig: StereoRig, hidden: slice, is_held: bool
+) -> None:
     truth = thread(0.0)
     curve = initialize(paint(rig, [truth], 0), rig, seed_on(rig, truth)).curve
-    shown = [[truth]] * 25 + [[]] * 12 + [[truth[:240], truth[330:]]] * 10 + [[truth]] * 10
+    parts = [part for part in (truth[: hidden.start], truth[hidden.stop :]) if len(part)]
+    shown = [[truth]] * 25 + [[]] * 12 + [parts] * 12 + [[truth]] * 10
     fields = [paint(rig, threads, i) for i, threads in enumerate(shown)]
     follower = Follower(curve, fields[0], rig, TrackingConfig())
     states = [follower.step(field, "0") for field in fields[1:]]
-    hidden = states[-20:-10]
-    assert hidden[-1].length == pytest.approx(100.0, rel=0.02)
-    assert 0.8 < hidden[-1].seen.mean() < 0.93
-    assert all(state.status is Status.LOST for state in hidden)
+    gone, while_hidden = states[-23], states[-11]
+    assert gone.status is Status.LOST
+    assert while_hidden.length == pytest.approx(100.0, rel=0.02)
+    assert (while_hidden.status is Status.TRACKING) == is_held
     assert states[-1].status is Status.TRACKING
 
 

@@ -40,6 +40,7 @@ from suturetrack.tracking.reliability import (
 from suturetrack.tracking.sampling import length_of, resampled, values_at, views_at
 from suturetrack.tracking.spacing import respace
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
+from suturetrack.tracking.whole import Whole
 from suturetrack.types import Bool, Nurbs, RidgeField, Status, ThreadState
 
 _NS = 1e-9
@@ -47,6 +48,8 @@ _NS = 1e-9
 _LEAP_PX, _LEAPS = 5.0, 6
 # Share of the samples that is as good as all.
 _ALL = 0.97
+# And what of a lost thread has to be plain to see, where both ends are and the rest is hidden.
+_BACK = 0.7
 # How long after the last doubt it is certain again where the thread runs.
 _SURE_AFTER_S = 0.08
 # Standard deviation, against its length, from which on the images do not tell where a curve runs.
@@ -92,6 +95,7 @@ class Follower:
         self.last_good = curve
         """The curve when it was last tracked."""
         self.known_length = KnownLength(length_of(curve))
+        self._whole = Whole.of(curve, now)
         self._lost = False
         self._certain_ns = now
         """When it was certain last where the thread runs, and for a moment before."""
@@ -121,6 +125,8 @@ class Follower:
         known = self.known_length = self.known_length.inherited(
             before.known_length, is_sure=is_sure
         )
+        if not is_sure:
+            self._whole = before._whole.learned(self.model.curve, self.model.capture_ns)
         self.model.ends = EndWatch(
             length_of(self.model.curve), self.model.capture_ns, max(known.possible)
         )
@@ -152,9 +158,11 @@ class Follower:
         seconds = (field.stamp.capture_ns - model.capture_ns) * _NS
         images = Images(field, self.rig, model.levels)
         if self._lost or self.known_length.is_short(length_of(model.curve)):
-            self._take_up_whole(images, seconds)
-            model = self.model
-        before, predicted = model.curve, model.motion.predict(model.curve, seconds)
+            self._take_up_whole(self._predicted(seconds), images)
+        if self.config.method != "paper" and not self._lost:
+            self._go_on_beyond(self._predicted(seconds), images)
+        model = self.model
+        before, predicted = model.curve, self._predicted(seconds)
         model.capture_ns = field.stamp.capture_ns
         if self.config.method == "paper":
             evidence, inserted, removed = self._follow_by_forces(images, neighbours)
@@ -183,6 +191,10 @@ class Follower:
         status = self._judge(evidence, astray, plain, seconds)
         return self._state(field, thread, evidence, status, events)
 
+    def _predicted(self, seconds: float) -> Nurbs:
+        """The curve so much later."""
+        return self.model.motion.predict(self.model.curve, seconds)
+
     def _judge(self, evidence: Evidence, astray: Bool, plain: Bool, seconds: float) -> Status:
         """The status, and what follows from it for the next field."""
         model, drift = self.model, self._drift
@@ -193,6 +205,8 @@ class Follower:
         self._lost = status is Status.LOST
         if status is Status.TRACKING:
             self.last_good = model.curve
+            known = Whole.of(model.curve, model.capture_ns) if model.ends.at_border else self._whole
+            self._whole = known.learned(model.curve, model.capture_ns)
         elif self._lost and (
             evidence.share < SOME or self.known_length.is_beyond_hope(length_of(model.curve))
         ):
@@ -241,7 +255,7 @@ class Follower:
         self.is_crowded = bool(evidence.alone.mean() <= _ALL)
         is_longer = not is_clear and known.is_exceeded(length, noise)
         self.makes_detour = is_longer or (not is_clear and known.is_undercut(length, noise))
-        if self._lost and (is_another or plain.mean() < 1 - ASTRAY):
+        if self._lost and (is_another or not self._is_back(plain, uncertain_s)):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
         is_vague = is_kinked or self._drift.gone.mean() > ASTRAY
@@ -252,6 +266,13 @@ class Follower:
         if status is Status.TRACKING and (is_vague or is_longer):
             return Status.OCCLUDED
         return status
+
+    def _is_back(self, plain: Bool, uncertain_s: float) -> bool:
+        """Whether enough of a lost thread is plain to see: all, or all but what is hidden in between."""
+        if plain.mean() >= 1 - ASTRAY:
+            return True
+        shows_ends = all(self.model.ends.seen) and not any(self._hidden.for_longer_than(0.0))
+        return uncertain_s == 0 and shows_ends and plain.mean() >= _BACK
 
     def _trim(self, wrong: Bool) -> None:
         """Cuts off what has left the thread at an end, to be found anew."""
@@ -282,17 +303,24 @@ class Follower:
         ends = EndWatch(self.known_length.now, model.capture_ns)
         self.model = replace(model, curve=self.last_good, motion=Motion.none(), ends=ends)
 
-    def _take_up_whole(self, images: Images, seconds: float) -> None:
+    def _take_up_whole(self, rest: Nurbs, images: Images) -> None:
         """Goes back to the last good curve, moved as a whole, if the images show more of it than of
         what is left."""
-        model = self.model
-        rest = model.motion.predict(model.curve, seconds)
         whole = shifted(self.last_good, images)
         of_whole, of_rest = (length_of(curve) * shown(curve, images) for curve in (whole, rest))
         if of_whole > of_rest + _MORE * self.known_length.now:
             self.last_good = whole
             self._start_again()
             self._drift = Drift.everywhere()
+
+    def _go_on_beyond(self, rest: Nurbs, images: Images) -> None:
+        """Goes back to the whole thread where more of it shows beyond what hides an end."""
+        whole = self._whole = self._whole.step(rest, images)
+        if whole.is_found:
+            self.known_length = self.known_length.again(whole.length)
+            self.last_good = whole.curve
+            self._start_again()
+            self._drift = Drift()
 
     def _follow_by_forces(
         self, images: Images, neighbours: Neighbours

@@ -69,6 +69,10 @@ class KnownLength:
         """With no more left than `length`, as far as anybody knows."""
         return replace(self, now=length, before_cut=max(self.possible), is_cut=False)
 
+    def again(self, length: float) -> KnownLength:
+        """With what was hidden in sight again."""
+        return replace(self, now=max(self.now, length))
+
     def learned(self, ends: EndWatch, seconds: float, *, is_clear: bool) -> KnownLength:
         """So much later; an end that is lost for a moment makes the thread no shorter, nor do other
         ridges that draw it aside."""
