@@ -458,6 +458,49 @@ def test_a_curve_that_lacks_an_end_is_what_a_look_finds(rig: StereoRig) -> None:
         assert sureness.is_sure == is_sure
 
 
+@pytest.mark.parametrize(
+    ("moved_px", "bent_s", "is_same"),
+    [(4.0, 0.0, True), (10.0, 0.0, True), (30.0, 0.0, False), (0.0, 0.6, False)],
+)
+def test_what_has_moved_a_little_as_a_whole_is_still_the_same(
+    rig: StereoRig, moved_px: float, bent_s: float, is_same: bool
+) -> None:
+    look = look_at(rig, thread(0.0), 0.9)
+    aside = np.array([0.0, moved_px * 200.0 / rig.focal, 0.0])
+    found = look_at(rig, thread(bent_s) + aside, 0.3).curve
+    sureness = Sureness(look, look.curve, 0, rig)
+    assert sureness.is_same(found, look.curve, may_move=True) == is_same
+    assert sureness.is_same(found, look.curve) == (is_same and moved_px < 5.0)
+
+
+def test_a_part_of_what_was_sure_does_not_take_its_place(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A tool may hide the rest, and look like an end."""
+    looks = []
+
+    def look(*args: object) -> Initialization:
+        found = replace(initialize(*args), confidence=0.95)  # type: ignore[arg-type]
+        looks.append(found)
+        return found if len(looks) == 1 else replace(found, curve=nurbs.part(found.curve, 0.0, 0.7))
+
+    looks_by(monkeypatch, look)
+    tracker, truths = Tracker(rig), [thread(i / FPS) for i in range(4 * FPS)]
+    tracker.seed(seed_on(rig, truths[0]))
+    states = []
+    for i, points in enumerate(truths):
+        states += tracker.step(paint(rig, [points], i)).states
+        if i == FPS // 2:
+            assert states[-1].status is Status.TRACKING
+            sureness, curve = tracker._threads["0"]._sureness, states[-1].curve
+            assert sureness is not None
+            assert curve is not None
+            sureness.revoke(curve, states[-1].stamp.capture_ns)
+    assert len(looks) > 3
+    assert min(state.length for state in states) > 98.0
+    assert rms(states[-1], truths[-1]) < 0.1
+
+
 @pytest.mark.parametrize("is_clear_once", [True, False])
 def test_places_that_are_clear_in_one_look_each_are_sure_together(
     rig: StereoRig, is_clear_once: bool

@@ -13,8 +13,8 @@ from suturetrack.types import Float64, Nurbs
 
 # Samples that a chord spans, and by how many a bend slides along the curve.
 _CHORD, _SLIDES = 2, 3
-# By how much more sharply than of late a thread bends, radians, and as a share.
-_SHARPER, _TIGHTER = math.radians(7.0), 0.25
+# By how much more sharply than of late a thread bends at most: radians, or a share if that is more.
+_SHARPER, _TIGHTER = math.radians(13.0), 0.4
 _OF_LATE_S = 1.0
 # How near to it something is unseen, samples.
 _NEAR = 4
@@ -28,8 +28,9 @@ class Bends:
     A thread is stiff: it bends more sharply little by little, even as a knot is tightened. A curve that
     has got a kink at once where a part of it is hidden has been drawn aside by what hides it, such as
     the edge of a tool.
-    Of 36,000 fields with curves called tracking, 27 % of the 439 wrong ones have such a kink, and 0.15 % of
-    the right ones.
+    On a real video with tools drawn over it, 73 % of 111 curves off by more than 8 px have such a kink, and
+    1.8 % of 2,521 that are right within 3 px; on synthetic clutter, 23 % of 368 off by more than 2 mm, and
+    0.03 % of 14,659 that are right within 1 mm.
     """
 
     def __init__(self) -> None:
@@ -42,7 +43,7 @@ class Bends:
         last = bends if self._of_late is None else self._of_late
         self._of_late = last + learned * (bends - last)
         near = maximum_filter1d(self._of_late, 2 * _SLIDES + 1)
-        sharper = bends - (1 + _TIGHTER) * near - _SHARPER
+        sharper = bends - near - np.maximum(_SHARPER, _TIGHTER * near)
         inner = slice(_CHORD, -_CHORD)
         is_beside_hidden = binary_dilation(~evidence.evenly_seen, iterations=_NEAR)[inner]
         return bool((is_beside_hidden & (sharper > 0))[_TIP - _CHORD : _CHORD - _TIP].any())

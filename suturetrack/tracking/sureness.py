@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, PlacedDoubts, remaining
@@ -139,10 +140,23 @@ class Sureness:
         is_likely = found.confidence >= SURE or (makes_detour and away < _OTHER_PX)
         return is_likely and away >= _SAME_PX
 
-    def is_same(self, found: Nurbs, followed: Nurbs) -> bool:
-        """Whether what was found is what is followed, which may lack a little at its ends."""
+    def is_same(self, found: Nurbs, followed: Nurbs, *, may_move: bool = False) -> bool:
+        """Whether what was found is what is followed, which may lack a little at its ends.
+
+        Args:
+            found, followed: the curves.
+            may_move: it may have moved a little as a whole since it was followed.
+        """
         both = zip(self._lines(found), self._lines(followed), strict=True)
-        return max(_apart(whole, part) for whole, part in both) < _SAME_PX
+        moved_px = _OTHER_PX if may_move else 0.0
+        return max(_apart(whole, part, moved_px) for whole, part in both) < _SAME_PX
+
+    def lacks_more(self, found: Nurbs, followed: Nurbs) -> bool:
+        """Whether what was found is a part of what is followed, and lacks more than a little."""
+        if length_of(found) > (1 - _LACKING) * length_of(followed):
+            return False
+        both = zip(self._lines(found), self._lines(followed), strict=True)
+        return all(np.max(cKDTree(whole).query(part)[0]) < _SAME_PX for part, whole in both)
 
     def _begin(self, found: Initialization, votes: float) -> None:
         """With what speaks for another curve."""
@@ -193,15 +207,18 @@ class Sureness:
         return self._rig.project(evaluate(curve, s))
 
 
-def _apart(whole: Float64, part: Float64) -> float:
-    """How far two lines, each (n, 2), are apart from end to end without what the second one lacks."""
+def _apart(whole: Float64, part: Float64, moved_px: float) -> float:
+    """How far two lines, each (n, 2), are apart from end to end without what the second one lacks, once
+    it is moved by so much at most."""
     reach = round(_LACKING * len(whole))
     start, stop = (
         nearest_index(tip, end)
         for tip, end in ((whole[:reach], part[0]), (whole[: -reach - 1 : -1], part[-1]))
     )
-    there = resample(whole[start : len(whole) - stop], _PLACES)
-    return _farthest(there, resample(part, _PLACES))
+    steps = resample(whole[start : len(whole) - stop], _PLACES) - resample(part, _PLACES)
+    moved = np.median(steps, axis=0)
+    moved *= min(moved_px / max(float(np.linalg.norm(moved)), 1e-9), 1.0)
+    return _farthest(steps, moved)
 
 
 def _farthest(one: Float64, other: Float64) -> float:

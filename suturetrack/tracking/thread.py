@@ -312,7 +312,7 @@ class Thread:
         before = self.follower.model.curve, self.follower.last_good
         rig, nowhere = self._setup.rig, np.zeros(RELIABILITY_SAMPLES, bool)
         return any(
-            self._sureness.is_same(found, curve)
+            self._sureness.is_same(found, curve, may_move=True)
             and not sprung_in_depth(curve, found, rig, nowhere).any()
             for curve in before
         )
@@ -326,6 +326,9 @@ class Thread:
         assert self._sureness is not None
         found, state = outcome.found, outcome.state
         if state is None or state.status is Status.LOST or self._is_stub(state):
+            return
+        # The rest may be hidden.
+        if self._was_sure and self._sureness.lacks_more(found.curve, search.followed):
             return
         if self._puts_right(found, state):
             self._hold(outcome, "put right", self._sureness)
