@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -26,6 +27,8 @@ from suturetrack.types import (
     StereoFrame,
 )
 
+_KEPT_FRAMES = 12
+"""Frames that were segmented since a slow tracker was given the one whose states come next."""
 _SEEN = 0.5
 """Share of a curve that must be seen to tell the thread's colour."""
 
@@ -102,8 +105,7 @@ class _Held:
     def __init__(self, bus: Bus, rig: StereoRig):
         self._states = bus.every(topics.STATE)
         self._rig = rig
-        self._shown: StereoFrame | None = None
-        """A frame whose states are awaited, however late they are."""
+        self._recent: deque[StereoFrame] = deque(maxlen=_KEPT_FRAMES)
         self.threads = {s.thread for s in bus.last(topics.STATE) if s.curve is not None}
         """Names of those of which nothing was learned yet."""
 
@@ -113,22 +115,18 @@ class _Held:
         Without its colour the tracker may hold a thread and yet not be sure of it.
 
         Args:
-            frame: the next one, to be kept where none is or where the tracker has gone past it.
+            frame: the next one, copied for the states that are still to come.
         """
-        shown = self._shown
-        is_past = shown is None
         while (state := self._states.get(0)) is not None:
-            if shown is None or state.stamp.released_ns < shown.stamp.released_ns:
-                continue
-            if state.thread not in self.threads:
-                continue
-            is_past = True
             is_seen = state.status is not Status.LOST and np.mean(state.seen) > _SEEN
-            if state.stamp == shown.stamp and is_seen:
+            shown = next((f for f in self._recent if f.stamp == state.stamp), None)
+            if shown is not None and is_seen and state.thread in self.threads:
                 self.threads.remove(state.thread)
                 yield seed_on(scaled(state, 1 / self._rig.metres_per_unit)), shown
-        if is_past:
-            self._shown = frame if self.threads else None
+        if self.threads:
+            self._recent.append(replace(frame, left=frame.left.copy(), right=frame.right.copy()))
+        else:
+            self._recent.clear()
 
 
 def warm_up(rig: StereoRig, config: SegmenterConfig) -> RidgeField:

@@ -228,13 +228,13 @@ def test_a_segmenter_that_is_started_again_learns_from_what_is_seen_of_a_thread(
     assert camera.wait_for_alive("segmenter", 60)
     shown = []
     for index in range(late + 2):
-        camera.publish(topics.FRAME, StereoFrame(Stamp(index, 0, index), *desk.images))
+        camera.publish(topics.FRAME, StereoFrame(Stamp(index, 0, 0), *desk.images))
         field = fields.get(20)
         assert field is not None
         shown.append(field.left.tobytes())
-        if index >= late:
-            seen_at = Stamp(index - late, 0, index - late)
-            tracker.publish(topics.STATE, replace(message, stamp=seen_at))
+        # Those of the other frames the tracker was too slow for.
+        if index == late:
+            tracker.publish(topics.STATE, replace(message, stamp=Stamp(late // 2, 0, 0)))
     rig.stop()
     assert not rig.errors
     assert len(set(shown[:-1])) == 1
