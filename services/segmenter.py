@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -115,7 +115,7 @@ class _Held:
         Without its colour the tracker may hold a thread and yet not be sure of it.
 
         Args:
-            frame: the next one, copied for the states that are still to come.
+            frame: the next one, kept for the states that are still to come.
         """
         while (state := self._states.get(0)) is not None:
             is_seen = state.status is not Status.LOST and np.mean(state.seen) > _SEEN
@@ -124,7 +124,7 @@ class _Held:
                 self.threads.remove(state.thread)
                 yield seed_on(scaled(state, 1 / self._rig.metres_per_unit)), shown
         if self.threads:
-            self._recent.append(replace(frame, left=frame.left.copy(), right=frame.right.copy()))
+            self._recent.append(frame)
         else:
             self._recent.clear()
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, PlacedDoubts, remaining
 from suturetrack.nurbs import evaluate
-from suturetrack.polylines import nearest_index, resample
+from suturetrack.polylines import nearest_index, polyline_distances, resample
 from suturetrack.tracking.sampling import length_of
 from suturetrack.types import Float64, Nurbs
 
@@ -156,7 +155,7 @@ class Sureness:
         if length_of(found) > (1 - _LACKING) * length_of(followed):
             return False
         both = zip(self._lines(found), self._lines(followed), strict=True)
-        return all(np.max(cKDTree(whole).query(part)[0]) < _SAME_PX for part, whole in both)
+        return all(polyline_distances(*lines).max() < _SAME_PX for lines in both)
 
     def _begin(self, found: Initialization, votes: float) -> None:
         """With what speaks for another curve."""
