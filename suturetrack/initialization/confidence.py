@@ -21,7 +21,7 @@ from suturetrack.initialization.doubts import (
 )
 from suturetrack.initialization.result import PlacedDoubts, in_words, remaining
 from suturetrack.initialization.samples import Samples
-from suturetrack.initialization.segments import Ridges
+from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.initialization.threads import Chain
 from suturetrack.polylines import (
     arc_lengths,
@@ -73,6 +73,9 @@ _NO_END = 0.4
 _FURTHER_PX, _FURTHER = 8, 0.4
 """By how many pixels one view's thread may go on behind an end of the curve, and what more leaves of the
 confidence: of 226 right starts that were sure none had it."""
+_STUB = 0.5
+"""Strength of what goes on, against the thread's, below which it may be too short to have a direction: the
+rim of a highlight."""
 _GRAVE = 0.53
 """What a grave doubt leaves of the confidence at most."""
 _FEW = 6
@@ -104,7 +107,9 @@ def judge(
     confidence, reasons = _of_the_whole(agreement, samples, sigma, nurbs.length(curve))
     doubts = _left_in_doubt(pixels, chains, ridges)
     reasons += _in_words(doubts, rig, scale)
-    further = [_ends_further_on(line, c.pixels) for line, c in zip(pixels, chains, strict=True)]
+    further = [
+        _ends_further_on(p, c.pixels, r) for p, c, r in zip(pixels, chains, ridges, strict=True)
+    ]
     left, right = (
         (*_placed(view, doubts, pixels, chains), *((float(end), _FURTHER) for end in further[view]))
         for view in (0, 1)
@@ -229,12 +234,16 @@ def _placed(
     return tuple(placed)
 
 
-def _ends_further_on(line: Float64, chain: Float64) -> list[int]:
+def _ends_further_on(line: Float64, chain: Float64, ridges: Ridges) -> list[int]:
     """The ends (0 or 1) of a curve, (k, 2) pixels, behind which a view's own thread goes on."""
     ends = []
     for points in (chain, chain[::-1]):
         near = np.flatnonzero(polyline_distances(points, line) < NEAR_PX)
-        if len(near) and near[0] > _FURTHER_PX:
+        if not len(near) or near[0] <= _FURTHER_PX:
+            continue
+        strength = ridges.sample(points)
+        is_strong = np.median(strength[: near[0]]) > _STUB * np.median(strength)
+        if is_strong or near[0] >= ARM:
             ends.append(round(nearest_index(line, points[near[0]]) / (len(line) - 1)))
     return ends
 

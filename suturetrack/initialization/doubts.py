@@ -89,14 +89,17 @@ def doubts(joints: Joints, entries: list[int], ridges: Ridges) -> list[Doubt]:
 
 def _at_merges(joints: Joints, entries: list[int]) -> list[tuple[int, str, float]]:
     within = joints.within_reach()
+    lengths = np.cumsum([len(joints.segments[entry // 2]) for entry in entries])
     found = []
-    for entry in entries[1:]:
+    for entry, before in zip(entries[1:], lengths[:-1], strict=True):
         if entry in joints.hidden:
             found.append((entry, HIDDEN, _HIDDEN))
             continue
         price = joints.price[entry, joints.partner[entry]]
         lead = min(_lead(joints, entry, entries, within), FREE_END)
         strain = price - _REASSURANCE * lead
+        if lead == FREE_END and min(before, lengths[-1] - before) < ARM:
+            continue  # There is no other way, and all that is in doubt is the tip.
         if price >= HIGHEST:
             found.append((entry, SHARP, 0.6))
         elif strain > 0:
@@ -173,13 +176,13 @@ def _at_tips(joints: Joints, entries: list[int], ridges: Ridges) -> list[tuple[i
             on = min((joints.price[tip, j] for j in within.get(tip, ())), default=np.inf)
             rest = 0.25 if on < _RUNS_ON else 0.4
             found.append((tip, "an end beside another ridge", rest))
-        if _is_beyond_gap(joints, tip, ridges):
+        if is_beyond_gap(joints, tip, ridges):
             found.append((tip, BEYOND, _BEYOND))
     return found
 
 
-def _is_beyond_gap(joints: Joints, tip: int, ridges: Ridges) -> bool:
-    """Whether the segment at a tip is shorter than a gap through which the thread leads there."""
+def is_beyond_gap(joints: Joints, tip: int, ridges: Ridges) -> bool:
+    """Whether the segment at a tip is shorter than a gap through which it is joined to the thread."""
     segment, start = inward(joints.segments, tip), joints.partner.get(tip ^ 1)
     if start is None:
         return False
@@ -193,10 +196,14 @@ def _is_beyond_gap(joints: Joints, tip: int, ridges: Ridges) -> bool:
 def _runs_into_another(joints: Joints, tip: int, entries: list[int], ridges: Ridges) -> bool:
     """Whether another ridge is at a tip, or, without a gap before it, the thread itself."""
     segment, own = inward(joints.segments, tip), {e // 2 for e in entries}
-    end = segment[0]
-    others = [s for k, s in enumerate(joints.segments) if k not in own]
-    if others and np.linalg.norm(np.concatenate(others) - end, axis=1).min() < TOUCHING_PX:
-        return True
+    end, level = segment[0], _CLEAR * float(np.median(ridges.sample(segment)))
+    for k, other in enumerate(joints.segments):
+        if k not in own and np.linalg.norm(other - end, axis=1).min() < TOUCHING_PX:
+            strand = [joints.segments[e // 2] for e in joints.follow(k) if e // 2 not in own]
+            points = np.concatenate(strand)
+            leads_away = np.linalg.norm(points - end, axis=1).max() > _LEAVES_PX
+            if leads_away and np.median(ridges.sample(points)) > level:
+                return True
     passing = [joints.segments[k] for k in own - {tip // 2}]
     passing.append(segment[2 * ARM :])
     points = np.concatenate(passing)

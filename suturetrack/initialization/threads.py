@@ -14,7 +14,14 @@ from scipy.spatial import cKDTree
 from suturetrack.initialization.colours import another_begins
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
-from suturetrack.initialization.doubts import FADES, RECOLOURED, Doubt, doubts, joining
+from suturetrack.initialization.doubts import (
+    FADES,
+    RECOLOURED,
+    Doubt,
+    doubts,
+    is_beyond_gap,
+    joining,
+)
 from suturetrack.initialization.joints import Joints, inward
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.topology import merge_ends
@@ -23,6 +30,8 @@ from suturetrack.types import Float32, Float64, read_only
 
 _FAINT = 0.4
 """Strength, against the rest of the thread, below which a last segment is no part of it."""
+_SPECK = 8
+"""Points below which one says nothing about where the thread goes on."""
 _FALLEN = 0.42
 """Strength, against the rest of the thread, of what goes on behind its end at most."""
 _FALL = 0.5
@@ -153,7 +162,7 @@ def follow_thread(
     """The merged segments through segment `origin`."""
     joints = merge_ends(ridges, config, depth)
     ridges = replace(ridges, segments=tuple(joints.segments))
-    entries = _without_faint_ends(ridges, joints.follow(origin), origin)
+    entries = _without_faint_ends(joints, ridges, joints.follow(origin), origin)
     line = _join([inward(ridges.segments, entry) for entry in entries])
     chain = Chain(line, tuple(doubts(joints, entries, ridges)))
     return Thread(ridges, joints, entries, origin, chain, np.empty((0, 2)))
@@ -226,15 +235,21 @@ def _falls_at(strength: Float64, first: int, fall_to: float, fallen: float) -> i
     return len(strength)
 
 
-def _without_faint_ends(ridges: Ridges, entries: list[int], origin: int) -> list[int]:
-    """Leaves out segments at either end that are far fainter than the thread: shadows, veins."""
-    strength = {e: ridges.sample(ridges.segments[e // 2]).mean() for e in entries}
-    for _ in (0, 1):
+def _without_faint_ends(
+    joints: Joints, ridges: Ridges, entries: list[int], origin: int
+) -> list[int]:
+    """Leaves out segments at either end that are far fainter than the thread, such as shadows and veins,
+    and specks behind gaps that are longer, such as rims of highlights."""
+    segments = joints.segments
+    strength = {e: ridges.sample(segments[e // 2]).mean() for e in entries}
+    for leaves in (1, 0):
         while entries[-1] // 2 != origin:
-            rest = entries[:-1]
-            sizes = [len(ridges.segments[e // 2]) for e in rest]
+            last, rest = entries[-1], entries[:-1]
+            sizes = [len(segments[e // 2]) for e in rest]
             level = np.average([strength[e] for e in rest], weights=sizes)
-            if strength[entries[-1]] > _FAINT * level:
+            is_short = len(segments[last // 2]) < _SPECK
+            is_speck = is_short and is_beyond_gap(joints, last ^ leaves, ridges)
+            if strength[last] > _FAINT * level and not is_speck:
                 break
             entries = rest
         entries = entries[::-1]
