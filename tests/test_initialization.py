@@ -558,6 +558,23 @@ def test_a_strand_of_another_colour_that_ends_on_a_thread_does_not_go_on_in_it(
         assert any("another strand that ends on it" in r for r in found.reasons) == is_doubtful
 
 
+@pytest.mark.parametrize(
+    ("length", "grey", "is_doubtful"), [(120, 110, True), (120, 165, False), (12, 110, False)]
+)
+def test_an_end_is_doubted_beside_what_may_be_thread_only(
+    rig: StereoRig, length: float, grey: int, is_doubtful: bool
+) -> None:
+    """Ridges that are far fainter, or lead nowhere, are not what the thread goes on as."""
+    t = np.linspace(0, 1, 500)
+    own = np.c_[180 + 260 * t, 240 + 60 * np.sin(3 * t)]
+    way = (own[-1] - own[-2]) / np.linalg.norm(own[-1] - own[-2])
+    other = own[-1] + 5 * way + length * (t[:, None] - 0.5) * [-way[1], way[0]]
+    field = painted([(other, (grey, grey, grey)), (own, BLUE)], rig)
+    found = initialize(field, rig, Seed(pixel=tuple(own[150])))
+    assert any("an end beside another ridge" in why for why in found.reasons) == is_doubtful
+    assert (found.confidence < 0.75) == is_doubtful
+
+
 def test_where_threads_touch_each_goes_on_in_its_own_colour(rig: StereoRig) -> None:
     """By their shapes alone, both would cross."""
     t = np.linspace(-1, 1, 600)

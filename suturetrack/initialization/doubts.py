@@ -98,11 +98,11 @@ def _at_merges(joints: Joints, entries: list[int]) -> list[tuple[int, str, float
         price = joints.price[entry, joints.partner[entry]]
         lead = min(_lead(joints, entry, entries, within), FREE_END)
         strain = price - _REASSURANCE * lead
-        if lead == FREE_END and min(before, lengths[-1] - before) < ARM:
-            continue  # There is no other way, and all that is in doubt is the tip.
+        # Without another way, all that is in doubt of a tip without a direction is where it ends.
+        is_tip = lead == FREE_END and min(before, lengths[-1] - before) < ARM
         if price >= HIGHEST:
             found.append((entry, SHARP, 0.6))
-        elif strain > 0:
+        elif strain > 0 and not is_tip:
             found.append((entry, CROSSING, max(1 - _STRAIN * strain, 0.1)))
         by_arms = joints.lead.get(entry, joints.lead.get(joints.partner[entry]))
         if by_arms is not None:
@@ -147,25 +147,33 @@ def _differs(strand: Float64, line: Float64, tints: Tints) -> bool:
 
 def joining(joints: Joints, entries: list[int], ridges: Ridges) -> list[int]:
     """The free ends of other strands, clear enough for threads, that run into its side."""
-    own = [inward(joints.segments, e) for e in entries]
+    own, indices = [inward(joints.segments, e) for e in entries], {e // 2 for e in entries}
     line, tangents = np.concatenate(own), np.concatenate([chain_tangents(s) for s in own])
     strength, tree = ridges.sample(line), cKDTree(line)
     found = []
     for end in joints.free:
+        if end // 2 in indices:
+            continue
         segment = inward(joints.segments, end)
         arm = segment[:ARM]
         distance, at = tree.query(arm[0])
         heading = chain_tangents(arm)[len(arm) // 2]
         if distance > _JOINS_PX or abs(float(heading @ tangents[at])) < _PARALLEL:
             continue
-        strand = [joints.segments[e // 2] for e in joints.follow(end // 2)]
-        if np.max(tree.query(np.concatenate(strand))[0]) < _LEAVES_PX:  # The rim of a highlight.
+        strand = _strand(joints, end // 2, indices)
+        if np.max(tree.query(strand)[0]) < _LEAVES_PX:  # The rim of a highlight.
             continue
         sides = strength[max(at - _SIDE, 0) : at + 1], strength[at : at + _SIDE]
         level = min(float(np.median(side)) for side in sides)
         if np.median(ridges.sample(segment)) > _CLEAR * level:
             found.append(end)
     return found
+
+
+def _strand(joints: Joints, segment: int, thread: set[int]) -> Float64:
+    """(k, 2) points of the strand of a segment, without those of the thread."""
+    entries = joints.follow(segment)
+    return np.concatenate([joints.segments[e // 2] for e in entries if e // 2 not in thread])
 
 
 def _at_tips(joints: Joints, entries: list[int], ridges: Ridges) -> list[tuple[int, str, float]]:
@@ -199,10 +207,9 @@ def _runs_into_another(joints: Joints, tip: int, entries: list[int], ridges: Rid
     end, level = segment[0], _CLEAR * float(np.median(ridges.sample(segment)))
     for k, other in enumerate(joints.segments):
         if k not in own and np.linalg.norm(other - end, axis=1).min() < TOUCHING_PX:
-            strand = [joints.segments[e // 2] for e in joints.follow(k) if e // 2 not in own]
-            points = np.concatenate(strand)
-            leads_away = np.linalg.norm(points - end, axis=1).max() > _LEAVES_PX
-            if leads_away and np.median(ridges.sample(points)) > level:
+            strand = _strand(joints, k, own)
+            leads_away = np.linalg.norm(strand - end, axis=1).max() > _LEAVES_PX
+            if leads_away and np.median(ridges.sample(strand)) > level:
                 return True
     passing = [joints.segments[k] for k in own - {tip // 2}]
     passing.append(segment[2 * ARM :])
