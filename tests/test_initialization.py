@@ -558,6 +558,14 @@ def test_a_strand_of_another_colour_that_ends_on_a_thread_does_not_go_on_in_it(
         assert any("another strand that ends on it" in r for r in found.reasons) == is_doubtful
 
 
+def bow() -> tuple[Float64, Float64, Float64, Float64]:
+    """Parameters (k,) and pixels (k, 2) of a thread, and its direction and normal at its last end."""
+    t: Float64 = np.linspace(0, 1, 500)
+    own = np.c_[180 + 260 * t, 240 + 60 * np.sin(3 * t)]
+    way = (own[-1] - own[-2]) / np.linalg.norm(own[-1] - own[-2])
+    return t, own, way, np.array([-way[1], way[0]])
+
+
 @pytest.mark.parametrize(
     ("length", "grey", "is_doubtful"), [(120, 110, True), (120, 165, False), (12, 110, False)]
 )
@@ -565,14 +573,37 @@ def test_an_end_is_doubted_beside_what_may_be_thread_only(
     rig: StereoRig, length: float, grey: int, is_doubtful: bool
 ) -> None:
     """Ridges that are far fainter, or lead nowhere, are not what the thread goes on as."""
-    t = np.linspace(0, 1, 500)
-    own = np.c_[180 + 260 * t, 240 + 60 * np.sin(3 * t)]
-    way = (own[-1] - own[-2]) / np.linalg.norm(own[-1] - own[-2])
-    other = own[-1] + 5 * way + length * (t[:, None] - 0.5) * [-way[1], way[0]]
+    t, own, way, normal = bow()
+    other = own[-1] + 5 * way + length * (t[:, None] - 0.5) * normal
     field = painted([(other, (grey, grey, grey)), (own, BLUE)], rig)
     found = initialize(field, rig, Seed(pixel=tuple(own[150])))
     assert any("an end beside another ridge" in why for why in found.reasons) == is_doubtful
     assert (found.confidence < 0.75) == is_doubtful
+
+
+@pytest.mark.parametrize(
+    ("turn", "aside", "ahead", "length", "grey"),
+    [
+        (0, 2, 6, 6, 120),
+        (30, 4, 4, 9, 145),
+        (70, 6, 6, 6, 120),
+        (20, 4, 3, 8, 160),
+        (40, 5, 3, 6, 135),
+    ],
+)
+def test_specks_behind_an_end_make_nothing_doubtful(
+    rig: StereoRig, turn: float, aside: float, ahead: float, length: float, grey: int
+) -> None:
+    """As the rims of highlights are."""
+    t, own, way, normal = bow()
+    heading = np.cos(np.radians(turn)) * way + np.sin(np.radians(turn)) * normal
+    speck = own[-1] + ahead * way + aside * normal + length * t[:, None] * heading
+    field = painted([(speck, (grey, grey, grey)), (own, BLUE)], rig)
+    found = initialize(field, rig, Seed(pixel=tuple(own[150])))
+    assert found.confidence > 0.9
+    assert not found.reasons
+    ends = rig.project(nurbs.evaluate(found.curve, np.array([0.0, 1.0])))[0]
+    assert np.linalg.norm(ends - own[-1], axis=1).min() < 2
 
 
 def test_where_threads_touch_each_goes_on_in_its_own_colour(rig: StereoRig) -> None:
