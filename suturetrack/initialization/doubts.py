@@ -57,7 +57,7 @@ _PARALLEL = 0.7
 _JOINS_PX = 8.0
 """How near to it such a strand ends: the thread draws its last points aside."""
 _CLEAR, _LEAVES_PX = 0.4, 15.0
-"""Strength of such a strand, against the thread's on the weaker side, and how far it comes from, at
+"""Strength of a strand at the thread's side or end, against the thread there, and how far away it leads, at
 least: another thread may have another colour, and a shadow has a quarter of the strength."""
 _SIDE, _AT = 40, 4
 """Points of the thread on each side of a place whose strength and colour count there, and those at the place
@@ -99,7 +99,7 @@ def _at_merges(joints: Joints, entries: list[int]) -> list[tuple[int, str, float
         lead = min(_lead(joints, entry, entries, within), FREE_END)
         strain = price - _REASSURANCE * lead
         # Without another way, all that is in doubt of a tip without a direction is where it ends.
-        is_tip = lead == FREE_END and min(before, lengths[-1] - before) < ARM
+        is_tip = lead >= FREE_END and min(before, lengths[-1] - before) < ARM
         if price >= HIGHEST:
             found.append((entry, SHARP, 0.6))
         elif strain > 0 and not is_tip:
@@ -147,12 +147,13 @@ def _differs(strand: Float64, line: Float64, tints: Tints) -> bool:
 
 def joining(joints: Joints, entries: list[int], ridges: Ridges) -> list[int]:
     """The free ends of other strands, clear enough for threads, that run into its side."""
-    own, indices = [inward(joints.segments, e) for e in entries], {e // 2 for e in entries}
-    line, tangents = np.concatenate(own), np.concatenate([chain_tangents(s) for s in own])
+    own = {e // 2 for e in entries}
+    pieces = [inward(joints.segments, e) for e in entries]
+    line, tangents = np.concatenate(pieces), np.concatenate([chain_tangents(p) for p in pieces])
     strength, tree = ridges.sample(line), cKDTree(line)
     found = []
     for end in joints.free:
-        if end // 2 in indices:
+        if end // 2 in own:
             continue
         segment = inward(joints.segments, end)
         arm = segment[:ARM]
@@ -160,7 +161,7 @@ def joining(joints: Joints, entries: list[int], ridges: Ridges) -> list[int]:
         heading = chain_tangents(arm)[len(arm) // 2]
         if distance > _JOINS_PX or abs(float(heading @ tangents[at])) < _PARALLEL:
             continue
-        strand = _strand(joints, end // 2, indices)
+        strand = _strand(joints, end // 2, own)
         if np.max(tree.query(strand)[0]) < _LEAVES_PX:  # The rim of a highlight.
             continue
         sides = strength[max(at - _SIDE, 0) : at + 1], strength[at : at + _SIDE]
@@ -201,16 +202,26 @@ def is_beyond_gap(joints: Joints, tip: int, ridges: Ridges) -> bool:
     return bool(is_unseen and gap > TOUCHING_PX and len(segment) < gap)
 
 
-def _runs_into_another(joints: Joints, tip: int, entries: list[int], ridges: Ridges) -> bool:
-    """Whether another ridge is at a tip, or, without a gap before it, the thread itself."""
-    segment, own = inward(joints.segments, tip), {e // 2 for e in entries}
+def _meets_strand(joints: Joints, tip: int, thread: set[int], ridges: Ridges) -> bool:
+    """Whether a strand at a tip is clear, and leads far enough away, for the thread to go on as it."""
+    segment = inward(joints.segments, tip)
     end, level = segment[0], _CLEAR * float(np.median(ridges.sample(segment)))
     for k, other in enumerate(joints.segments):
-        if k not in own and np.linalg.norm(other - end, axis=1).min() < TOUCHING_PX:
-            strand = _strand(joints, k, own)
+        if k not in thread and np.linalg.norm(other - end, axis=1).min() < TOUCHING_PX:
+            strand = _strand(joints, k, thread)
             leads_away = np.linalg.norm(strand - end, axis=1).max() > _LEAVES_PX
             if leads_away and np.median(ridges.sample(strand)) > level:
                 return True
+    return False
+
+
+def _runs_into_another(joints: Joints, tip: int, entries: list[int], ridges: Ridges) -> bool:
+    """Whether another ridge is at a tip, or, without a gap before it, the thread itself."""
+    own = {e // 2 for e in entries}
+    if _meets_strand(joints, tip, own, ridges):
+        return True
+    segment = inward(joints.segments, tip)
+    end = segment[0]
     passing = [joints.segments[k] for k in own - {tip // 2}]
     passing.append(segment[2 * ARM :])
     points = np.concatenate(passing)

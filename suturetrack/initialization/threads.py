@@ -247,9 +247,9 @@ def _without_faint_ends(
             last, rest = entries[-1], entries[:-1]
             sizes = [len(segments[e // 2]) for e in rest]
             level = np.average([strength[e] for e in rest], weights=sizes)
+            is_faint = strength[last] <= _FAINT * level
             is_short = len(segments[last // 2]) < _SPECK
-            is_speck = is_short and is_beyond_gap(joints, last ^ leaves, ridges)
-            if strength[last] > _FAINT * level and not is_speck:
+            if not (is_faint or (is_short and is_beyond_gap(joints, last ^ leaves, ridges))):
                 break
             entries = rest
         entries = entries[::-1]
