@@ -11,7 +11,6 @@ from contextlib import suppress
 
 import numpy as np
 
-from services.bus import Reader
 from services.seeding import seed_on
 from services.wire import scaled
 from suturetrack import nurbs
@@ -35,12 +34,17 @@ class Adaptation:
     """Keeps a frame until its states are sure to be there, then has the segmenter learn from both.
 
     Args:
-        states: every state of the rig, in metres.
+        states: the next state of the rig, in metres, waiting so many seconds for it; None if none comes.
         lockstep: wait for states, so that the same frames always give the same fields.
     """
 
     def __init__(
-        self, segmenter: Segmenter, rig: StereoRig, states: Reader[ThreadState], *, lockstep: bool
+        self,
+        segmenter: Segmenter,
+        rig: StereoRig,
+        states: Callable[[float], ThreadState | None],
+        *,
+        lockstep: bool,
     ):
         self._segmenter, self._rig, self._states = segmenter, rig, states
         self._patience = _LONGEST_WAIT_S if lockstep else 0.0
@@ -96,13 +100,11 @@ class Adaptation:
 
     def _wait_while(self, lacks: Callable[[], bool]) -> None:
         """In lock-step: takes in states for as long as some lack, and come."""
-        while (
-            self._patience and lacks() and (state := self._states.get(self._patience)) is not None
-        ):
+        while self._patience and lacks() and (state := self._states(self._patience)) is not None:
             self._take_in(state)
 
     def _take_in_all(self) -> None:
-        while (state := self._states.get(0)) is not None:
+        while (state := self._states(0)) is not None:
             self._take_in(state)
 
     def _take_in(self, state: ThreadState) -> None:

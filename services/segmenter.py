@@ -64,7 +64,7 @@ def run(service: Service, config: SegmenterConfig) -> None:
     recorder = service.record(rig, config)
     seedings, drops = bus.every(topics.SEEDING), bus.every(topics.DROPPED)
     states = bus.every(topics.STATE)
-    adaptation = Adaptation(segmenter, rig, states, lockstep=config.service.lockstep)
+    adaptation = Adaptation(segmenter, rig, states.get, lockstep=config.service.lockstep)
     given = [Seed(str(i), pixel=pixel) for i, pixel in enumerate(config.seed)]
     held = _Held(bus, rig) if config.service.resume else None
     if held is not None:

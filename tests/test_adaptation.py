@@ -63,7 +63,7 @@ class Desk:
         seed = Seed(pixel=paper.seed_pixel())
         self.segmenter.learn(StereoFrame(Stamp(0, 0, 0), *paper.render(0)), seed)
         states = reader.every(topics.STATE)
-        self.adaptation = Adaptation(self.segmenter, self.rig, states, lockstep=True)
+        self.adaptation = Adaptation(self.segmenter, self.rig, states.get, lockstep=True)
         truth = paper.truth(0)[0]
         knots = nurbs.clamped_knots(np.linspace(0, 1, 40)[1:-1], 3)
         s = np.linspace(0, 1, len(truth.points))

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from services.bench import (
     faults,
+    footage,
     initialization,
     latency,
     load,
@@ -20,6 +21,7 @@ from services.bench import (
     tracking,
 )
 from services.bench.faults import FaultsBench
+from services.bench.footage import FootageBench
 from services.bench.initialization import InitializationBench
 from services.bench.latency import LatencyBench
 from services.bench.load import LoadBench
@@ -41,6 +43,11 @@ _PLOTS = {
         Plot("length_error_percent", "data", reference="published_length_error_percent"),
         Plot("worst_end", "data", logarithmic=True),
         Plot("seconds", "data"),
+    ),
+    "footage": (
+        Plot("tracked_percent", "spoil"),
+        Plot("false_percent", "spoil"),
+        Plot("mean_px", "spoil", logarithmic=True),
     ),
     "segmentation": (Plot("pair_ms", "filter", logarithmic=True), Plot("f1", "filter")),
     "latency": (Plot("p50_ms", "process"), Plot("p99_ms", "process")),
@@ -65,6 +72,7 @@ class BenchConfig:
     what: Annotated[
         Annotated[TrackingBench, tyro.conf.subcommand("tracking")]
         | Annotated[InitializationBench, tyro.conf.subcommand("initialization")]
+        | Annotated[FootageBench, tyro.conf.subcommand("footage")]
         | Annotated[SegmentationBench, tyro.conf.subcommand("segmentation")]
         | Annotated[LatencyBench, tyro.conf.subcommand("latency")]
         | Annotated[RecordingBench, tyro.conf.subcommand("recording")]
@@ -95,6 +103,8 @@ def run(config: BenchConfig) -> None:
             name, table = "tracking", [*tracking.run(config.what, console)]
         case InitializationBench():
             name, table = "initialization", [*initialization.run(config.what, console)]
+        case FootageBench():
+            name, table = "footage", [*footage.run(config.what, console)]
         case SegmentationBench():
             name, table = "segmentation", [*segmentation.run(config.what, console)]
         case LatencyBench():

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
-import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context, parent_process
 from typing import Literal
 
 import cv2
@@ -19,6 +15,7 @@ from rich.progress import track
 
 from services.adaptation import follow
 from services.bench import report
+from services.bench.pool import side_by_side
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.polylines import polyline_offsets
@@ -163,9 +160,8 @@ class Row:
 
 def rows(config: TrackingBench) -> Iterator[list[Row]]:
     """The rows of every case, as they are done."""
-    for option in ("seeds", "workers"):
-        if getattr(config, option) < 1:
-            raise InputError(f"{option} {getattr(config, option)}: use 1 or more")
+    if config.seeds < 1:
+        raise InputError(f"seeds {config.seeds}: use 1 or more")
     for name in config.scenarios:
         if name not in SCENARIOS:
             raise InputError(f"no scenario {name!r}; there are {', '.join(SCENARIOS)}")
@@ -177,11 +173,7 @@ def rows(config: TrackingBench) -> Iterator[list[Row]]:
         for name in config.scenarios
         for k in range(config.seeds)
     ]
-    # Numba and OpenCV keep threads, which do not survive a fork.
-    context = get_context("spawn")
-    with ProcessPoolExecutor(config.workers, context, initializer=_end_with_parent) as pool:
-        for future in as_completed([pool.submit(run_case, case) for case in cases]):
-            yield future.result()
+    yield from side_by_side(run_case, cases, config.workers)
 
 
 def run(config: TrackingBench, console: Console) -> list[Row]:
@@ -303,7 +295,7 @@ def summarise(case: Case, method: Method, thread: str, scores: list[FrameScore])
     error = (length - true_length)[whole]
     ends = np.array([s.ends for s in scores], dtype=float)[whole]
     rms = _column(scores, "rms")[tracking]
-    losses, longest = _losses(tracking, case.fps)
+    lost, longest = losses(tracking, case.fps)
     return Row(
         scenario=case.scenario,
         rig=case.rig,
@@ -312,7 +304,7 @@ def summarise(case: Case, method: Method, thread: str, scores: list[FrameScore])
         thread=thread,
         frames=len(scores),
         tracked_percent=100 * float(tracking.mean()),
-        losses=losses,
+        losses=lost,
         longest_recovery_s=longest,
         false_percent=100 * float(wrong.mean()),
         rms=_rms(rms),
@@ -334,19 +326,7 @@ def summarise(case: Case, method: Method, thread: str, scores: list[FrameScore])
     )
 
 
-def _end_with_parent() -> None:
-    """Ends this worker as soon as the benchmark that started it is gone."""
-    parent = parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _losses(tracking: Bool, fps: float) -> tuple[int, float]:
+def losses(tracking: Bool, fps: float) -> tuple[int, float]:
     """How often the thread went from held to not held, and the longest time until it was held again."""
     held = np.flatnonzero(tracking)
     if len(held) == 0:
