@@ -13,13 +13,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from services.bench import BenchConfig, report, segmentation
+from services.bench import BenchConfig, footage, report, segmentation
 from services.bench import run as bench
+from services.bench.footage import FootageBench
 from services.bench.initialization import InitializationBench
 from services.bench.initialization import rows as initialization_rows
 from services.bench.segmentation import SegmentationBench
+from services.bench.spoils import SPOILS, Gripper
 from services.bench.tracking import Case, FrameScore, TrackingBench, score, summarise
 from services.bench.tracking import rows as tracking_rows
+from services.sources import InputConfig
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.polylines import polyline_distances
@@ -234,3 +237,70 @@ def runs(stat: Path) -> bool:
         return stat.read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+FOOTAGE = FootageBench(
+    InputConfig("stage:figure8-175", frames=8), spoils=("nothing", "noise", "backwards")
+)
+
+
+def test_spoiled_footage_is_judged_by_the_footage_as_it_is() -> None:
+    table = footage.run(FOOTAGE, Console(quiet=True))
+    assert [row.spoil for row in table] == ["nothing", "noise", "backwards"]
+    for row in table:
+        assert row.frames == 8
+        assert row.tracked_percent == row.right_percent == 100
+        assert row.false_percent == 0
+        assert row.mean_px < 0.3
+        assert row.largest_px < 2
+    assert table[1].mean_px > 0
+
+
+def test_a_curve_elsewhere_is_false() -> None:
+    table = footage.run(
+        replace(FOOTAGE, spoils=("noise",), false_beyond_px=1e-6), Console(quiet=True)
+    )
+    assert table[0].false_percent == table[0].tracked_percent == 100
+    assert table[0].right_percent == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"spoils": ("rain",)}, "no spoil 'rain'; there are nothing, noise"),
+        ({"seeds": 0}, "seeds 0"),
+        ({"workers": 0}, "workers 0"),
+        ({"input": InputConfig("stage:figure8-175", loop=5)}, "use footage with an end"),
+        ({"seed": (5.0, 5.0)}, "nothing is tracked in the footage as it is"),
+    ],
+)
+def test_footage_that_cannot_be_judged_is_refused(change: dict[str, object], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        footage.run(replace(FOOTAGE, **change), Console(quiet=True))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("shape", [(480, 640, 3), (480, 640)])
+def test_spoils_change_images_and_keep_what_they_are(shape: tuple[int, ...]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    draw = np.array([0.2, 0.4, 0.6, 0.8])
+    for name, spoil in SPOILS.items():
+        if spoil.image is None:
+            continue
+        made = spoil.image(image, 0.5, draw)
+        assert made.dtype == np.uint8
+        assert made.shape == (shape[:2] if name == "gray" else shape)
+        if name != "gray" or len(shape) == 3:
+            assert not np.array_equal(made, image)
+
+
+def test_the_gripper_covers_what_it_is_said_to_hide() -> None:
+    rig = make_rig()
+    thread = np.linspace([-40.0, 0.0, 200.0], [40.0, 10.0, 200.0], 400)
+    empty = np.full((480, 640), 255, np.uint8)
+    gripper = Gripper(rig, np.array([0.1, 0.2, 0.3, 0.9]))
+    left, right = gripper.over((empty, empty), thread, 0.0)
+    hidden = gripper.hides((empty, empty), thread, 0.0)
+    assert 0.02 < hidden.mean() < 0.5
+    pixels = [np.rint(view).astype(int).T for view in rig.project_raw(thread)]
+    covered = (left[pixels[0][1], pixels[0][0]] < 250) | (right[pixels[1][1], pixels[1][0]] < 250)
+    assert (covered == hidden).mean() > 0.95

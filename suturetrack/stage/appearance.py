@@ -165,7 +165,7 @@ def compressed(image: Image, quality: int | None) -> Image:
     if quality is None:
         return image
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), np.uint8)
 
 
 def _or(given: float | None, drawn: float) -> float:
