@@ -25,6 +25,7 @@ from suturetrack.tracking.fitting import fit_widely
 from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import KnownLength
+from suturetrack.tracking.memory import Memory
 from suturetrack.tracking.motion import Motion
 from suturetrack.tracking.mouth import Mouth
 from suturetrack.tracking.regrowth import loose_tails, regrown
@@ -62,6 +63,9 @@ _REGROWN_S = _LED_BACK_S = 0.09
 _HIDDEN_S, _GONE_S = 0.3, 2.0
 # For how long a curve is called tracking that is held in depth against what the views show.
 _HELD_S = 0.3
+# For how long after a kink a curve is not called tracking, and nothing is learned of its length.
+_UNBENT_S, _SMOOTH_S = 0.1, 0.3
+_TROUBLED_S = 2.0
 # What has to be seen of the last good curve beyond what is seen of the rest, against the length.
 _MORE = 0.05
 # Places on a thread that keep other threads away.
@@ -96,10 +100,12 @@ class Follower:
         """The curve when it was last tracked."""
         self.known_length = KnownLength(length_of(curve))
         self._whole = Whole.of(curve, now)
+        self._memory = Memory()
         self._lost = False
         self._certain_ns = now
         """When it was certain last where the thread runs, and for a moment before."""
-        self._doubted_ns = self._regrown_ns = self._led_back_ns = -(1 << 62)
+        self._doubted_ns = self._regrown_ns = self._led_back_ns = self._kinked_ns = -(1 << 62)
+        self._untracked_ns = -(1 << 62)
         self._drift = Drift()
         self._bends = Bends()
         self._held: Bool = np.zeros(RELIABILITY_SAMPLES, bool)
@@ -126,6 +132,7 @@ class Follower:
             before.known_length, is_sure=is_sure
         )
         if not is_sure:
+            self._memory = before._memory
             self._whole = before._whole.learned(self.model.curve, self.model.capture_ns)
         self.model.ends = EndWatch(
             length_of(self.model.curve), self.model.capture_ns, max(known.possible)
@@ -154,13 +161,15 @@ class Follower:
 
     def step(self, field: RidgeField, thread: str, neighbours: Neighbours = NOBODY) -> ThreadState:
         """The thread in the next field; `neighbours` are other threads."""
-        model = self.model
+        model, events = self.model, list[str]()
         seconds = (field.stamp.capture_ns - model.capture_ns) * _NS
         images = Images(field, self.rig, model.levels)
         if self._lost or self.known_length.is_short(length_of(model.curve)):
             self._take_up_whole(self._predicted(seconds), images)
         if self.config.method != "paper" and not self._lost:
             self._go_on_beyond(self._predicted(seconds), images)
+            if self._go_back(self._predicted(seconds), images, neighbours):
+                events.append("taken back to where it shows")
         model = self.model
         before, predicted = model.curve, self._predicted(seconds)
         model.capture_ns = field.stamp.capture_ns
@@ -184,7 +193,6 @@ class Follower:
             images = replace(images, levels=model.levels)
         if not self._held.any():
             self._free_ns = model.capture_ns
-        events = []
         if inserted or removed:
             events.append(f"control points: {inserted} inserted, {removed} removed")
         astray, plain = evidence.astray(images, neighbours)
@@ -199,12 +207,16 @@ class Follower:
         """The status, and what follows from it for the next field."""
         model, drift = self.model, self._drift
         self._hidden.step(evidence.evenly_hidden & ~drift.outside, model.capture_ns)
+        if self._bends.step(model.curve, evidence, seconds):
+            self._kinked_ns = model.capture_ns
         wrong, uncertain_s = self._wrong(evidence, astray, plain, seconds)
-        is_kinked = self._bends.step(model.curve, evidence, seconds)
-        status = self._status(evidence, plain, uncertain_s, is_kinked)
+        status = self._status(evidence, plain, uncertain_s)
         self._lost = status is Status.LOST
+        if status is not Status.TRACKING:
+            self._untracked_ns = model.capture_ns
         if status is Status.TRACKING:
             self.last_good = model.curve
+            self._memory = self._memory.learned(model.curve, self.known_length, model.capture_ns)
             known = Whole.of(model.curve, model.capture_ns) if model.ends.at_border else self._whole
             self._whole = known.learned(model.curve, model.capture_ns)
         elif self._lost and (
@@ -234,7 +246,8 @@ class Follower:
         is_certain = (wrong | self._drift.anywhere).mean() <= ASTRAY
         is_certain &= not (overlong or known.is_short(length))
         has_ends = bool(plain[[0, 1, -2, -1]].all())
-        if is_certain and is_whole and has_ends and not (self._lost or known.is_cut):
+        is_smooth = (model.capture_ns - self._kinked_ns) * _NS > _SMOOTH_S
+        if is_certain and is_whole and is_smooth and has_ends and not (self._lost or known.is_cut):
             known = known.learned(ends, seconds, is_clear=evidence.is_clear(plain))
         self.known_length = known
         if not is_certain:
@@ -243,9 +256,7 @@ class Follower:
             self._certain_ns = model.capture_ns
         return wrong, (model.capture_ns - self._certain_ns) * _NS
 
-    def _status(
-        self, evidence: Evidence, plain: Bool, uncertain_s: float, is_kinked: bool
-    ) -> Status:
+    def _status(self, evidence: Evidence, plain: Bool, uncertain_s: float) -> Status:
         """The status; a curve that was lost must have its length again, and be seen, to be held."""
         model, known, noise = self.model, self.known_length, evidence.length_noise
         length = length_of(model.curve)
@@ -258,7 +269,8 @@ class Follower:
         if self._lost and (is_another or not self._is_back(plain, uncertain_s)):
             return Status.LOST
         status = judge(evidence, (model.capture_ns - model.seen_ns) * _NS, uncertain_s)
-        is_vague = is_kinked or self._drift.gone.mean() > ASTRAY
+        is_vague = self._drift.gone.mean() > ASTRAY
+        is_vague |= (model.capture_ns - self._kinked_ns) * _NS <= _UNBENT_S
         is_vague |= (model.capture_ns - self._free_ns) * _NS > _HELD_S
         is_vague |= any(self._hidden.for_longer_than(_HIDDEN_S))
         is_vague |= bool(self._leaps.any()) and not known.is_reached(length)
@@ -321,6 +333,18 @@ class Follower:
             self.last_good = whole.curve
             self._start_again()
             self._drift = Drift()
+
+    def _go_back(self, predicted: Nurbs, images: Images, neighbours: Neighbours) -> bool:
+        """Goes back to where the thread was, if it still shows there; whether it does."""
+        if (self.model.capture_ns - self._untracked_ns) * _NS > _TROUBLED_S:
+            return False
+        self._memory, before = self._memory.step(predicted, images, neighbours)
+        if before is None:
+            return False
+        self.last_good, self.known_length = before
+        self._start_again()
+        self._drift, self._bends = Drift(), Bends()
+        return True
 
     def _follow_by_forces(
         self, images: Images, neighbours: Neighbours

@@ -27,6 +27,8 @@ _OWN_PX, _TOUCHES_PX, _LEAVES_PX = 2.0, 5.0, 6.0
 _LONG, _FROM_ENDS, _KNOT = 5.0, 5.0, 8.0
 # How far around the curve is looked, in the same.
 _MARGIN = 12.0
+# Looks without it after which what was found has passed by.
+_PASSED = 3
 # Branches that begin within so many such distances of one another are the same one in both views, and
 # one that crosses the curve on both sides of it; what lies still has to begin nearer on the other side.
 _SAME, _ACROSS = 12.0, 4.0
@@ -43,14 +45,21 @@ class Strangers:
 
     is_found: bool = False
     """Whether a ridge that has moved branches off the curve, in both views, at two looks in a row."""
+    _quiet: int | None = None
+    """Looks without a suspicion since something was found; None while nothing was."""
     _suspected: bool = False
     """The same at the last look alone: a curve may be off in a single field that is blurred."""
     _past: tuple[tuple[int, tuple[Image, Image]], ...] = ()
     """Capture times and where there were ridges, left and right, a bit for each pixel."""
 
+    @property
+    def are_gone(self) -> bool:
+        """Whether nothing has been suspected for so long that what was found only passed by."""
+        return self._quiet is not None and self._quiet >= _PASSED
+
     def of_another(self) -> Strangers:
         """The same past, of which nothing has been said about another curve yet."""
-        return replace(self, is_found=False, _suspected=False)
+        return replace(self, is_found=False, _quiet=None, _suspected=False)
 
     def step(self, curve: Nurbs, seen: Bool, images: Images, others: Neighbours) -> Strangers:
         """With the next field; most fields change nothing.
@@ -78,7 +87,12 @@ class Strangers:
                 branches &= _branches(power, stayed, view, shown, known.pixels, own_px)
         suspected = bool(branches.any())
         now_ridges = _packed(powers[0]), _packed(powers[1])
-        return Strangers(suspected and self._suspected, suspected, (*past, (now, now_ridges)))
+        is_found, quiet = suspected and self._suspected, self._quiet
+        if is_found:
+            quiet = 0
+        elif quiet is not None:
+            quiet = 0 if suspected else quiet + 1
+        return Strangers(is_found, quiet, suspected, (*past, (now, now_ridges)))
 
 
 def _packed(power: Float32) -> Image:

@@ -74,6 +74,8 @@ class Sureness:
         self._rig = rig
         self._begin(found, _votes(found.confidence))
         self._accused: Float64 | None = None if before is None else before._accused
+        self._is_revoked = False
+        """Whether it was sure of the curve that is followed, and is no more."""
         self._single = SURE if is_known else _SINGLE
         """Confidence of a look that needs no other."""
         enough = SURE if is_known else _AT_ONCE
@@ -100,10 +102,16 @@ class Sureness:
     def revoke(self, curve: Nurbs, now_ns: int) -> None:
         """Makes what was sure open again: looks have to tell."""
         if self.is_sure:
-            self._accused = self._outline(curve)
+            self._accused, self._is_revoked = self._outline(curve), True
             self.is_sure, self._votes, self._single = False, _HOPELESS, _SINGLE
             self._length = 0.0
             self._looks, self._last_ns = 0, now_ns
+
+    def reinstate(self) -> None:
+        """Takes back what was revoked: the accusation was about something else."""
+        if self._is_revoked:
+            self._accused, self._is_revoked = None, False
+            self.is_sure, self._votes = True, _ENOUGH
 
     def weigh(self, found: Initialization, followed: Nurbs) -> bool:
         """Adds a look; whether what it found, in the direction of what is followed, takes its place."""
@@ -126,6 +134,7 @@ class Sureness:
         is_outvoted = self._votes < 0
         if is_outvoted:
             self._begin(found, -self._votes)
+            self._is_revoked = False
         self.is_sure = is_outvoted and found.confidence >= _SINGLE
         self._shape = self._outline(found.curve if is_outvoted else followed)
         return is_outvoted

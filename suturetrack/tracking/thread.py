@@ -159,6 +159,8 @@ class Thread:
         self._strangers = self._strangers.step(model.curve, state.seen, images, others)
         if self._strangers.is_found:
             self._sureness.revoke(model.curve, field.stamp.capture_ns)
+        elif self._strangers.are_gone and state.status is Status.TRACKING:
+            self._sureness.reinstate()
 
     def _come_to(self, state: ThreadState) -> None:
         """What is not sure to be the thread is not called so."""
