@@ -21,7 +21,10 @@ MARKS = {
     "removed": (YELLOW, MarkerShape.Square),
 }
 """The kinds of events and what marks them, the one that matters most first."""
-_FOUND = ("found", "found again", "found elsewhere", "found for sure", "put right", "recovered")
+_FOUND = (
+    *("found", "found again", "found elsewhere", "found for sure"),
+    *("put right", "recovered", "taken back"),
+)
 _CONTROL_POINTS = re.compile(r"control points: (\d+) inserted, (\d+) removed")
 
 

@@ -169,7 +169,7 @@ class Follower:
         if self.config.method != "paper" and not self._lost:
             self._go_on_beyond(self._predicted(seconds), images)
             if self._go_back(self._predicted(seconds), images, neighbours):
-                events.append("taken back to where it shows")
+                events.append("taken back")
         model = self.model
         before, predicted = model.curve, self._predicted(seconds)
         model.capture_ns = field.stamp.capture_ns
