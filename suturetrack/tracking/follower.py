@@ -65,6 +65,7 @@ _HIDDEN_S, _GONE_S = 0.3, 2.0
 _HELD_S = 0.3
 # For how long after a kink a curve is not called tracking, and nothing is learned of its length.
 _UNBENT_S, _SMOOTH_S = 0.1, 0.3
+# For how long after a curve was not tracked it is looked for where it was before.
 _TROUBLED_S = 2.0
 # What has to be seen of the last good curve beyond what is seen of the rest, against the length.
 _MORE = 0.05
