@@ -17,7 +17,7 @@ from rich.progress import track
 from services.adaptation import Adaptation
 from services.bench import report
 from services.bench.pool import side_by_side
-from services.bench.spoils import SPOILS, Gripper, Pair
+from services.bench.spoils import SPOILS, Pair, Spoiler
 from services.bench.tracking import losses
 from services.sources import InputConfig, open_input
 from services.wire import scaled
@@ -140,35 +140,40 @@ def _as_it_is(config: FootageBench) -> Iterator[Float64 | None]:
 def run_case(case: Case) -> Row:
     """Tracks the spoiled footage from a place on the thread in its first frame."""
     cv2.setNumThreads(1)
-    spoil = SPOILS[case.spoil]
-    rng = np.random.default_rng(case.seed)
-    draw = rng.random(4)
     footage, rig = open_input(case.config.input)
     footage.close()
-    gripper = Gripper(rig, draw) if spoil.gripper else None
-    pairs = list(_pairs(case.config))
-    order = range(len(pairs))[:: spoil.step]
-    held = next(c for c in case.curves if c is not None)
-    chain: Chain | None = None
+    spoil, rng = SPOILS[case.spoil], np.random.default_rng(case.seed)
+    spoiler = Spoiler(spoil, rig, rng.random(4))
+    pairs = list(_pairs(case.config))[:: spoil.step]
+    truths = case.curves[:: spoil.step]
+    threads = _filled(truths)
+    shown = spoiler.in_sight(pairs[0], threads[0])
+    place = shown[round(rng.uniform(*_SEED_SHARES) * (len(shown) - 1))]
+    chain = Chain(rig, _seed_at(rig, place))
     states, milliseconds = [], []
-    for number, i in enumerate(order):
+    for number, (pair, thread) in enumerate(zip(pairs, threads, strict=True)):
         seconds = number / footage.fps
-        pair, curve = pairs[i], case.curves[i]
-        held = curve if curve is not None else held
-        if gripper is not None:
-            pair = gripper.over(pair, held, seconds)
-        if spoil.image is not None:
-            left, right = (spoil.image(image, seconds, draw) for image in pair)
-            pair = left, right
-        if chain is None:
-            shown = held if gripper is None else held[~gripper.hides(pair, held, 0.0)]
-            place = round(rng.uniform(*_SEED_SHARES) * (len(shown) - 1))
-            u, v = rig.project_raw(shown[place : place + 1])[0][0]
-            chain = Chain(rig, Seed(pixel=(float(u), float(v))))
+        left, right = spoiler.spoiled(pair, thread, seconds)
         began = time.perf_counter()
-        states.append(chain.step(StereoFrame(Stamp(number, round(seconds * 1e9), 0), *pair)))
+        states.append(chain.step(StereoFrame(Stamp(number, round(seconds * 1e9), 0), left, right)))
         milliseconds.append(1000 * (time.perf_counter() - began))
-    return _row(case, rig, states, [case.curves[i] for i in order], milliseconds, footage.fps)
+    return _row(case, rig, states, truths, milliseconds, footage.fps)
+
+
+def _filled(curves: Sequence[Float64 | None]) -> list[Float64]:
+    """Each curve, or the last one before it where there is none."""
+    last = next(curve for curve in curves if curve is not None)
+    filled = []
+    for curve in curves:
+        last = last if curve is None else curve
+        filled.append(last)
+    return filled
+
+
+def _seed_at(rig: StereoRig, place: Float64) -> Seed:
+    """A seed on the pixel of a (3,) point."""
+    u, v = rig.project_raw(place[None])[0][0]
+    return Seed(pixel=(float(u), float(v)))
 
 
 class Chain:

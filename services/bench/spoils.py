@@ -19,7 +19,6 @@ from suturetrack.types import Bool, Float32, Float64, Image
 
 Pair = tuple[Image, Image]
 _FIXED_POSE = Viewpoint(np.eye(3), np.zeros(3))
-_FADE_PX = 2.0
 _LIFT_MM, _OVER_MM, _AWAY_MM = 3.0, 8.0, 40.0
 
 
@@ -178,3 +177,32 @@ class Gripper:
 def _coloured(image: Image) -> Float32:
     planes = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
     return planes.astype(np.float32)
+
+
+class Spoiler:
+    """Spoils one run.
+
+    Args:
+        spoil: how.
+        rig: the cameras of the footage.
+        draw: (4,) numbers from [0, 1): what it is like, this time.
+    """
+
+    def __init__(self, spoil: Spoil, rig: StereoRig, draw: Float64) -> None:
+        self._image, self._draw = spoil.image, draw
+        self._gripper = Gripper(rig, draw) if spoil.gripper else None
+
+    def spoiled(self, pair: Pair, thread: Float64, time: float) -> Pair:
+        """Both raw images, so many seconds after the first; the thread is (N, 3), rectified left frame."""
+        if self._gripper is not None:
+            pair = self._gripper.over(pair, thread, time)
+        if self._image is not None:
+            pair = self._image(pair[0], time, self._draw), self._image(pair[1], time, self._draw)
+        return pair
+
+    def in_sight(self, pair: Pair, thread: Float64) -> Float64:
+        """(n, 3) those of the thread's places that are in sight in the first pair; all if none is."""
+        if self._gripper is None:
+            return thread
+        shown = thread[~self._gripper.hides(pair, thread, 0.0)]
+        return shown if len(shown) else thread
