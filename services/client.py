@@ -205,9 +205,11 @@ class Client:
         Raises:
             Refused: there is no thread.
             Unavailable: nobody answers.
-            InputError: not exactly one place, or a bad name; nothing in the area; no laser's spot, or
-                several.
+            InputError: not exactly one place, a bad name or timeout; nothing in the area; no laser's spot,
+                or several.
         """
+        if (_plain(timeout, (), "timeout") or 0.0) < 0:
+            raise InputError(f"timeout {timeout!r}: use seconds, 0 or more")
         if sum((pixel is not None, point is not None, area is not None, laser)) != 1:
             raise InputError("give exactly one of a pixel, a point, an area and the laser")
         if view not in ("left", "right"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -203,6 +204,9 @@ def test_seeds_are_answered_or_refused(stage: Stage, curve: Nurbs) -> None:
     with pytest.raises(Refused, match="no ridge there") as refusal:
         stage.client.seed((1.0, 2.0))
     assert refusal.value.candidates == ((5.0, 6.0),)
+    for wrong in (-1.0, math.nan, "soon"):
+        with pytest.raises(InputError, match=r"timeout .*: use"):
+            stage.client.seed((1.0, 2.0), timeout=wrong)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="exactly one"):
         stage.client.seed()
     with pytest.raises(InputError, match="thread 'a/b'"):
