@@ -435,6 +435,22 @@ def test_an_edge_that_draws_a_bow_straight_is_not_called_tracking(
     assert all(state.status is Status.OCCLUDED for state in taken_for_it)
 
 
+def test_a_kink_is_doubted_for_a_moment_longer_than_it_is_seen(rig: StereoRig) -> None:
+    points, tracker = thread(0.0), Tracker(rig)
+    tracker.seed(seed_on(rig, points))
+    states = []
+    for i in range(2 * FPS):
+        states.append(tracker.step(paint(rig, [points], i)).states[0])
+        if i == FPS:
+            follower = tracker._threads["0"].follower
+            assert follower is not None
+            follower._kinked_ns = states[-1].stamp.capture_ns
+    is_tracked = [state.status is Status.TRACKING for state in states]
+    assert is_tracked[FPS]
+    assert not any(is_tracked[FPS + 1 : FPS + 3])
+    assert all(is_tracked[FPS + 4 :])
+
+
 @pytest.mark.parametrize("start_s", [0.0, 0.7, 1.5])
 def test_a_curve_does_not_spring_aside_in_depth(rig: StereoRig, start_s: float) -> None:
     truths = [thread(start_s + i / FPS / 3) for i in range(45)]
