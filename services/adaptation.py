@@ -46,7 +46,7 @@ class Adaptation:
         *,
         lockstep: bool,
     ):
-        self._segmenter, self._rig, self._states = segmenter, rig, states
+        self._segmenter, self._rig, self._next_state = segmenter, rig, states
         self._patience = _LONGEST_WAIT_S if lockstep else 0.0
         self._pause_ns = _SOON_NS
         """Until the next look at threads of which nothing was learned yet."""
@@ -100,11 +100,13 @@ class Adaptation:
 
     def _wait_while(self, lacks: Callable[[], bool]) -> None:
         """In lock-step: takes in states for as long as some lack, and come."""
-        while self._patience and lacks() and (state := self._states(self._patience)) is not None:
+        while (
+            self._patience and lacks() and (state := self._next_state(self._patience)) is not None
+        ):
             self._take_in(state)
 
     def _take_in_all(self) -> None:
-        while (state := self._states(0)) is not None:
+        while (state := self._next_state(0)) is not None:
             self._take_in(state)
 
     def _take_in(self, state: ThreadState) -> None:

@@ -279,6 +279,13 @@ def test_footage_that_cannot_be_judged_is_refused(change: dict[str, object], tol
         footage.run(replace(FOOTAGE, **change), Console(quiet=True))  # type: ignore[arg-type]
 
 
+def test_frames_of_which_none_can_be_judged_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    curves = [None, np.zeros((200, 3)), None, None]
+    monkeypatch.setattr(footage, "_as_it_is", lambda _: iter(curves))
+    with pytest.raises(InputError, match="nothing is tracked"):
+        footage.run(replace(FOOTAGE, spoils=("every-third",)), Console(quiet=True))
+
+
 @pytest.mark.parametrize("shape", [(480, 640, 3), (480, 640)])
 def test_spoils_change_images_and_keep_what_they_are(shape: tuple[int, ...]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -19,7 +20,7 @@ from services.bench import report
 from services.bench.pool import side_by_side
 from services.bench.spoils import SPOILS, Pair, Spoiler
 from services.bench.tracking import losses
-from services.sources import InputConfig, open_input
+from services.sources import Footage, InputConfig, open_input
 from services.wire import scaled
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
@@ -93,7 +94,7 @@ def run(config: FootageBench, console: Console) -> list[Row]:
     if config.seeds < 1:
         raise InputError(f"seeds {config.seeds}: use 1 or more")
     curves = tuple(track(_as_it_is(config), "Tracking as it is", console=console, transient=True))
-    if all(curve is None for curve in curves):
+    if any(all(c is None for c in curves[:: SPOILS[name].step]) for name in config.spoils):
         raise InputError("nothing is tracked in the footage as it is: `suturetrack run` shows why")
     cases = [
         Case(config, name, config.first_seed + k, curves)
@@ -124,28 +125,26 @@ def run(config: FootageBench, console: Console) -> list[Row]:
 def _as_it_is(config: FootageBench) -> Iterator[Float64 | None]:
     """The thread in every frame of the footage; None where it is not tracked."""
     footage, rig = open_input(config.input)
-    try:
+    with closing(footage):
         if footage.live or config.input.loop is not None:
             raise InputError(f"source {config.input.source}: use footage with an end")
         pixel = config.seed or next(iter(footage.seeds), None)
         if pixel is None:
             raise InputError("--seed U V is needed: a pixel on the thread in the first left image")
         chain = Chain(rig, Seed(pixel=pixel))
-        for i, pair in enumerate(_pairs(config)):
+        for i, pair in enumerate(_pairs(footage, config.input.frames)):
             yield _points(chain.step(StereoFrame(Stamp(i, round(i * 1e9 / footage.fps), 0), *pair)))
-    finally:
-        footage.close()
 
 
 def run_case(case: Case) -> Row:
     """Tracks the spoiled footage from a place on the thread in its first frame."""
     cv2.setNumThreads(1)
     footage, rig = open_input(case.config.input)
-    footage.close()
+    with closing(footage):
+        pairs = list(_pairs(footage, case.config.input.frames))
     spoil, rng = SPOILS[case.spoil], np.random.default_rng(case.seed)
     spoiler = Spoiler(spoil, rig, rng.random(4))
-    pairs = list(_pairs(case.config))[:: spoil.step]
-    truths = case.curves[:: spoil.step]
+    pairs, truths = pairs[:: spoil.step], case.curves[:: spoil.step]
     threads = _filled(truths)
     shown = spoiler.in_sight(pairs[0], threads[0])
     place = shown[round(rng.uniform(*_SEED_SHARES) * (len(shown) - 1))]
@@ -180,18 +179,17 @@ class Chain:
     """Segmenter and tracker of one thread, as the processes run them in lock-step."""
 
     def __init__(self, rig: StereoRig, seed: Seed) -> None:
-        self._rig, self._seed = rig, seed
+        self._rig, self._unlearned = rig, [seed]
         self._segmenter, self._tracker = Segmenter(rig), Tracker(rig)
         self._states: deque[ThreadState] = deque()
         self._adaptation = Adaptation(self._segmenter, rig, self._next, lockstep=True)
-        self._begun = False
 
     def step(self, frame: StereoFrame) -> ThreadState:
         """The thread in the next frame."""
-        if not self._begun:
-            self._segmenter.learn(frame, self._seed)
-            self._tracker.seed(self._seed)
-            self._begun = True
+        while self._unlearned:
+            seed = self._unlearned.pop()
+            self._segmenter.learn(frame, seed)
+            self._tracker.seed(seed)
         self._adaptation.catch_up()
         (state,) = self._tracker.step(self._segmenter.step(frame)).states
         self._states.append(scaled(state, self._rig.metres_per_unit))
@@ -202,15 +200,12 @@ class Chain:
         return self._states.popleft() if self._states else None
 
 
-def _pairs(config: FootageBench) -> Iterator[Pair]:
-    footage, _ = open_input(config.input)
-    try:
-        index = 0
-        while (exposure := footage.read(index)) is not None and index != config.input.frames:
-            yield exposure.left, exposure.right
-            index += 1
-    finally:
-        footage.close()
+def _pairs(footage: Footage, frames: int | None) -> Iterator[Pair]:
+    """Both raw images of every frame, or of so many."""
+    index = 0
+    while index != frames and (exposure := footage.read(index)) is not None:
+        yield exposure.left, exposure.right
+        index += 1
 
 
 def _points(state: ThreadState) -> Float64 | None:

@@ -19,6 +19,7 @@ from suturetrack.types import Bool, Float32, Float64, Image
 
 Pair = tuple[Image, Image]
 _FIXED_POSE = Viewpoint(np.eye(3), np.zeros(3))
+# How far the gripper is above the thread, over it, and away from it at most.
 _LIFT_MM, _OVER_MM, _AWAY_MM = 3.0, 8.0, 40.0
 
 
@@ -31,7 +32,7 @@ class Spoil:
     gripper: bool = False
     """A gripper comes and goes over the thread."""
     step: int = 1
-    """Only every so manyth frame; below 0 from the last one back."""
+    """Only every so manyth frame, so that all moves as many times as fast; below 0 from the last one back."""
 
 
 def _noise(image: Image, time: float, draw: Float64) -> Image:
