@@ -16,6 +16,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, InitializationError, initialize
 from suturetrack.initialization.arms import Arms
 from suturetrack.initialization.config import InitializationConfig
+from suturetrack.initialization.crest import View, find_crest
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.ends import read_end
 from suturetrack.initialization.segments import find_ridges, split_at_touches
@@ -319,6 +320,39 @@ def test_a_thread_that_ends_on_another_one_far_from_its_end_is_not_taken_for_a_b
     seed = tuple(rig.project(one[150])[0])
     found = initialize(field_of(left, right, rig), rig, Seed(pixel=seed))
     assert abs(curve_error(dense(found.curve), one).length_percent) < 3
+
+
+def sharp_corner(rig: StereoRig, arm_px: float) -> Float64:
+    """(1400, 3) a thread that turns back at 60 degrees to an arm of that length."""
+    t, tip = np.linspace(0, 1, 700)[:, None], np.array([220.0, 190.0])
+    along, back = ([np.cos(a), np.sin(a)] for a in (0.5, 0.5 - np.pi / 3))
+    pixels = np.r_[tip + 300 * t[::-1] * along, tip + arm_px * t * back]
+    depth = np.r_[200 + 6 * t, 206 + 6 * t]
+    centre = np.asarray(rig.left.projection)[:2, 2]
+    return np.c_[(pixels - centre) / rig.focal * depth, depth]
+
+
+@pytest.mark.parametrize("arm_px", [40.0, 60.0])
+def test_an_arm_behind_a_sharp_corner_is_the_thread_where_it_is_alone(
+    rig: StereoRig, arm_px: float
+) -> None:
+    truth = sharp_corner(rig, arm_px)
+    left, right = rig.project(truth)
+    field = field_of(draw(left, rig), draw(right, rig), rig)
+    found = initialize(field, rig, Seed(pixel=tuple(left[300])))
+    error = curve_error(dense(found.curve), truth)
+    assert abs(error.length_percent) < 2
+    assert max(error.ends) < 1
+
+
+def test_crests_count_less_where_a_thread_comes_back_beside_itself(rig: StereoRig) -> None:
+    there, back = np.arange(100.0, 300, 2), np.arange(300.0, 200, -2)
+    pixels = np.r_[np.c_[there, 0 * there + 300], np.c_[back, 0 * back + 304.5]]
+    image = draw(pixels, rig)
+    crest = find_crest(View(field_of(image, image, rig).left, np.empty((0, 2))), pixels)
+    assert crest.clear[:45].min() > 0.7
+    assert crest.clear[55:90].max() < 0.2
+    assert crest.clear[110:145].max() < 0.2
 
 
 @pytest.mark.parametrize("crosses", [True, False])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -69,7 +70,7 @@ class Arms:
             i, j = merges.pairs[k].tolist()
             if min(self._lead(i), self._lead(j)) < _RIVAL:
                 cost[k] += ENERGY * (self._step(i, j) + self._change_of_colour(i, j))
-        return Merges(merges.pairs, cost, merges.touching)
+        return replace(merges, cost=cost)
 
     def change(self, pairs: list[Pair], others: list[Pair]) -> float | None:
         """What it would cost if the arms of some ends were joined as `others`, and not as `pairs`;

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack.kernels import search
 from suturetrack.kernels.widths import moments, single
-from suturetrack.polylines import polyline_tangents
+from suturetrack.polylines import arc_lengths, polyline_tangents
 from suturetrack.types import Float32, Float64
 
 _OFFSETS = np.arange(-4.0, 4.01, 0.5)
@@ -22,6 +22,8 @@ _ASIDE_PX = 5.0
 """Distance up to which another strand draws a crest aside."""
 _DRAWN = 0.1
 """How much such a crest counts."""
+_ITSELF_PX = 11.0
+"""Length of a curve between two places that near, from which it comes back beside itself there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +54,8 @@ class Crest:
     response: Float64
     """(k,) eq. (4)'s integrand at the crest, in [0, 1]; 0 where it is unseen."""
     clear: Float64
-    """(k,) in [0, 1]; low where the ridge is wider than elsewhere, or near that of another strand,
-    which draws the crest aside."""
+    """(k,) in [0, 1]; low where the ridge is wider than elsewhere, or near that of another strand, or where
+    the curve comes back beside itself, which draws the crest aside."""
 
     @property
     def trust(self) -> Float64:
@@ -75,5 +77,15 @@ def find_crest(view: View, pixels: Float64) -> Crest:
     usual = float(np.median(spread[seen])) if seen.any() else 1.0
     heights = np.take_along_axis(profiles, peak[:, None], 1)[:, 0]
     normals = np.c_[-tangents[:, 1], tangents[:, 0]]
-    clear = single(spread, usual) * view.clear(pixels)
+    clear = single(spread, usual) * np.minimum(view.clear(pixels), _clear_of_itself(pixels))
     return Crest(normals, np.where(seen, offsets, 0.0), np.where(seen, heights, 0.0), clear)
+
+
+def _clear_of_itself(pixels: Float64) -> Float64:
+    """(k,) in [0, 1]: low where the curve through (k, 2) pixels comes back beside itself."""
+    near = cKDTree(pixels).query_pairs(_ASIDE_PX, output_type="ndarray")
+    travelled = arc_lengths(pixels)
+    back = near[travelled[near[:, 1]] - travelled[near[:, 0]] > _ITSELF_PX]
+    clear = np.ones(len(pixels))
+    clear[back] = _DRAWN
+    return clear

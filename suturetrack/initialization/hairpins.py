@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from suturetrack.initialization.joints import Joints
-from suturetrack.initialization.pricing import HIGHEST
+from suturetrack.initialization.pricing import FEW_ENDS, HIGHEST
 
 _LONGEST = 60
 """Points of a stub at most."""
@@ -11,8 +11,6 @@ _SMOOTH = 0.5
 """Price of a merge up to which a strand runs on smoothly into a stub."""
 _SHARP = 1.4
 """And up to which it may where hardly anything but the thread is there."""
-_FEW_ENDS = 6
-"""Free ends of a view that shows hardly anything else: a thread has but two."""
 
 
 def double_stubs(joints: Joints) -> None:
@@ -23,7 +21,7 @@ def double_stubs(joints: Joints) -> None:
     partner, price = joints.partner, joints.price
     while True:
         free = joints.free
-        most = _SMOOTH if len(free) > _FEW_ENDS else _SHARP
+        most = _SMOOTH if len(free) > FEW_ENDS else _SHARP
         stubs = {end ^ 1 for end in free if len(joints.segments[end // 2]) <= _LONGEST}
         ways = [
             (cost, mouth, waiting)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from suturetrack.initialization.pricing import FREE_END, HIGHEST, Merges
+from suturetrack.initialization.pricing import FREE_END, Merges
 from suturetrack.types import Float64, Int64
 
 _OUT_OF_REACH = 2.0
-"""Price of joining two ends that are too far apart to be priced."""
+"""Price of joining two ends that are too far apart to be priced, against the highest."""
 
 Pair = tuple[int, int]
 """Two ends."""
@@ -28,6 +28,8 @@ class Joints:
     """Those of the ridges, and once more those that two strands share."""
     price: dict[Pair, float]
     """Of every pair of ends within reach, both ways round."""
+    free_end: float = FREE_END
+    """Of an end that is joined to none."""
     partner: dict[int, int] = field(default_factory=dict)
     """The end that each joined end is joined to."""
     bent: frozenset[int] = frozenset()
@@ -41,11 +43,17 @@ class Joints:
     """Which segment each copy is of."""
 
     @classmethod
-    def priced(cls, segments: Iterable[Float64], merges: Merges) -> Joints:
+    def priced(cls, segments: Iterable[Float64], merges: Merges, free_end: float) -> Joints:
         """With nothing joined yet."""
         pairs, costs = merges.pairs.tolist(), merges.cost.tolist()
         price = {(i, j): cost for (i, j), cost in zip(pairs, costs, strict=True)}
-        return cls(list(segments), price | {(j, i): cost for (i, j), cost in price.items()})
+        price |= {(j, i): cost for (i, j), cost in price.items()}
+        return cls(list(segments), price, free_end)
+
+    @property
+    def highest(self) -> float:
+        """The highest price that is paid for a join: that of the two ends without it."""
+        return 2 * self.free_end
 
     @property
     def free(self) -> list[int]:
@@ -54,13 +62,13 @@ class Joints:
 
     def price_of(self, pair: Pair) -> float:
         """Of any pair of ends."""
-        return self.price.get(pair, _OUT_OF_REACH)
+        return self.price.get(pair, _OUT_OF_REACH * self.highest)
 
     def within_reach(self) -> dict[int, list[int]]:
         """The ends that each end might be joined to."""
         within: dict[int, list[int]] = {}
         for (i, j), cost in self.price.items():
-            if cost < HIGHEST:
+            if cost < self.highest:
                 within.setdefault(i, []).append(j)
         return within
 
@@ -131,10 +139,10 @@ class Joints:
                 for a, b in self.partner.items()
                 if a not in ring and (i, a) in price
             ]
-            added, i, j, a, b = min(ways, default=(HIGHEST, 0, 0, 0, 0))
-            if added < HIGHEST:
-                self.join(i, a, HIGHEST)
-                self.join(j, b, HIGHEST)
+            added, i, j, a, b = min(ways, default=(self.highest, 0, 0, 0, 0))
+            if added < self.highest:
+                self.join(i, a, self.highest)
+                self.join(j, b, self.highest)
 
     def exchange(self) -> None:
         """Swaps partners as long as that lowers the total."""
@@ -143,7 +151,7 @@ class Joints:
         while improved:
             improved = False
             for i, j in list(self.price):
-                if self.partner.get(i) == j or self.price[i, j] >= HIGHEST:
+                if self.partner.get(i) == j or self.price[i, j] >= self.highest:
                     continue
                 added, left, pairs = self.swap(i, j, within)
                 if added < -1e-9:
@@ -159,17 +167,17 @@ class Joints:
         """What joining the ends i and j would add to the total, the ends that lose their partners, and
         the cheapest pairs for all of them."""
         left = [self.partner[end] for end in (i, j) if end in self.partner]
-        ways: list[tuple[float, list[Pair]]] = [(FREE_END * len(left), [])]
+        ways: list[tuple[float, list[Pair]]] = [(self.free_end * len(left), [])]
         if len(left) == 2 and left[1] in within.get(left[0], ()):
             ways.append((self.price[left[0], left[1]], [(left[0], left[1])]))
         if len(left) == 1:
             free = [k for k in within.get(left[0], ()) if k not in self.partner and k not in (i, j)]
-            ways += [(self.price[left[0], k] - FREE_END, [(left[0], k)]) for k in free]
+            ways += [(self.price[left[0], k] - self.free_end, [(left[0], k)]) for k in free]
         cost, pairs = min(ways)
         added = self.price[i, j] + cost - self._paid(i) - self._paid(j)
         return added, left, [(i, j), *pairs]
 
     def _paid(self, end: int) -> float:
         if end not in self.partner:
-            return FREE_END
-        return min(self.price[end, self.partner[end]], HIGHEST)
+            return self.free_end
+        return min(self.price[end, self.partner[end]], self.highest)

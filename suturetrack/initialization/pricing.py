@@ -28,10 +28,17 @@ _SWING = 0.01
 _BRIDGE_SAMPLES = 12
 _AT_ONCE = 4096
 """Pairs priced in one go, so that much clutter takes no more memory."""
+_STRAND, _AS_STRONG = 20, 0.5
+"""Points, and strength against the average, from which a segment may be a part of a thread, and no speck
+or rim."""
 TOUCHING_PX = 6.0
 """Ends this near over ridge belong together at any angle: a sharp bend."""
 FREE_END = 0.5
 """Price of an end without a partner."""
+DEAR_END = 2.0
+"""And where it may be no end: all that a view shows may be one thread, and that has but two."""
+FEW_ENDS = 6
+"""Ends without a partner, at most, of a view that shows hardly anything but a thread."""
 HIGHEST = 2 * FREE_END
 """The highest price that is paid for a merge: that of the two ends without it."""
 
@@ -46,6 +53,13 @@ class Merges:
     """(m,)."""
     touching: Bool
     """(m,) whether ridge joins the two ends, whatever their angle."""
+    alike: Bool
+    """(m,) whether both are near and of strands as strong as any: a thread may turn round there."""
+
+    def of_one_thread(self) -> Merges:
+        """Those that are no dearer than two ends, or of ends that are alike."""
+        kept = (self.cost < HIGHEST) | self.alike
+        return Merges(self.pairs[kept], self.cost[kept], self.touching[kept], self.alike[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +101,8 @@ def price_merges(ridges: Ridges, config: InitializationConfig) -> Merges:
     near = tips.strength(ridges)
     # A highlight at a junction fades one arm of a segment, and not the segment.
     whole = np.repeat([np.median(ridges.sample(s)) for s in ridges.segments], 2)
-    short = np.repeat([max(1 - len(s) / ARM, 0.0) for s in ridges.segments], 2)
+    size = np.repeat([len(s) for s in ridges.segments], 2)
+    short = np.maximum(1 - size / ARM, 0.0)
     positions = tips.points[:, 0]
     pairs = cKDTree(positions).query_pairs(2 * config.gap_px, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
@@ -99,7 +114,10 @@ def price_merges(ridges: Ridges, config: InitializationConfig) -> Merges:
     shape[hooked] = np.minimum(shape[hooked], others)
     ratio = np.minimum(*(abs(np.log(s[i] / s[j])) for s in (near, whole)))
     cost = shape + 0.25 * ratio**2 + _SHORT * np.maximum(short[i], short[j])
-    return Merges(pairs, cost, (distance < TOUCHING_PX) & (weakest >= config.low))
+    touching = (distance < TOUCHING_PX) & (weakest >= config.low)
+    is_strand = (size >= _STRAND) & (whole > _AS_STRONG * np.average(whole, weights=size))
+    alike = (distance < 2 * TOUCHING_PX) & is_strand[i] & is_strand[j]
+    return Merges(pairs, cost, touching, alike)
 
 
 def _tip(segment: Float64, clear: int) -> Float64:

@@ -18,7 +18,9 @@ _SPACING_PX = 2.0
 """Distance of the samples that hold the curve, px."""
 _FARTHEST_PX = 1e5
 """Length in the images beyond which a curve has come apart."""
-_LEAST_NOISE_PX = 0.03
+_LEAST_NOISE_PX = 0.025
+_NOISE = 0.7
+"""Share of the mean square of the offsets that is noise; the rest is what the curve does not follow yet."""
 _STAY = 0.01
 """Weight, against that of a crest, which keeps samples from sliding along the thread."""
 _UNSEEN = 0.02
@@ -103,10 +105,10 @@ class Samples:
 
     @property
     def variance(self) -> float:
-        """Mean square of the offsets from curve to crest, px^2, and not less than that of their noise."""
+        """Of the noise of the offsets from curve to crest, px^2."""
         squares = sum((c.trust * c.offsets**2).sum() for c in self.crests)
         mean = squares / max(sum(c.trust.sum() for c in self.crests), 1e-9)
-        return max(float(mean), _LEAST_NOISE_PX**2)
+        return max(_NOISE * float(mean), _LEAST_NOISE_PX**2)
 
     @property
     def image_axes(self) -> Float64:

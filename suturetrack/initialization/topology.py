@@ -12,7 +12,7 @@ from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.hairpins import double_stubs
 from suturetrack.initialization.joints import Joints, Pair, inward
-from suturetrack.initialization.pricing import FREE_END, HIGHEST, Merges, price_merges
+from suturetrack.initialization.pricing import DEAR_END, FEW_ENDS, FREE_END, Merges, price_merges
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.polylines import unit
 
@@ -35,19 +35,26 @@ def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None
     """Pairs up the ends so that all merges and free ends together cost least (almost: by exchange).
 
     Ends whose arms differ in colour are dearer to join, and with `depth` those whose arms differ in that.
+    Where the view shows hardly anything but a thread, free ends are dearer if that leaves its own two.
     """
     if not ridges.segments:
         return Joints([], {})
     merges = price_merges(ridges, config)
     first = _merge(ridges, merges, None)
     arms = Arms(first.segments, first.partner, merges, depth, ridges.tints)
-    return _merge(ridges, arms.with_steps(merges), arms)
+    merges = arms.with_steps(merges)
+    joints = _merge(ridges, merges, arms)
+    if 2 < len(joints.free) <= FEW_ENDS:
+        one_thread = _merge(ridges, merges.of_one_thread(), arms, DEAR_END)
+        if len(one_thread.free) == 2:
+            return one_thread
+    return joints
 
 
-def _merge(ridges: Ridges, merges: Merges, arms: Arms | None) -> Joints:
-    joints = Joints.priced(ridges.segments, merges)
+def _merge(ridges: Ridges, merges: Merges, arms: Arms | None, free_end: float = FREE_END) -> Joints:
+    joints = Joints.priced(ridges.segments, merges, free_end)
     order = np.argsort(merges.cost)
-    joints.join_free(merges.pairs[order[merges.cost[order] < HIGHEST]])
+    joints.join_free(merges.pairs[order[merges.cost[order] < joints.highest]])
     joints.exchange()
     if arms is not None:
         _uncross(joints, arms)
@@ -133,7 +140,7 @@ def _share(joints: Joints, arms: Arms | None) -> None:
     partner = joints.partner
     waiting: dict[int, tuple[float, int]] = {}
     for (i, j), cost in joints.price.items():
-        if i in partner and j not in partner and cost < HIGHEST:
+        if i in partner and j not in partner and cost < joints.highest:
             waiting[i] = min(waiting.get(i, (np.inf, -1)), (cost, j))
     found = [(waiting[run[0]][0] + waiting[run[-1] ^ 1][0], run) for run in _runs(waiting, partner)]
     taken: set[int] = set()
