@@ -972,7 +972,7 @@ def test_the_unit_does_not_matter(rig: StereoRig, curve: Nurbs, baseline: float)
     assert there.confidence == pytest.approx(here.confidence)
 
 
-@pytest.mark.parametrize("rows", [-4.0, -2.0, -0.6, 0.4, 1.0])
+@pytest.mark.parametrize("rows", [-4.0, -2.0, -0.85, -0.6, 0.12, 0.4, 1.0])
 def test_rows_off_the_calibration_are_measured_and_do_not_spoil_the_curve(rows: float) -> None:
     scene = open_scene("figure8-175", 3, picture=Picture("black", "plain"))
     left, right = scene.render(0)

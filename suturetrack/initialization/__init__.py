@@ -135,7 +135,7 @@ def _initialize(
     colours = field.colours and (field.colours[0], field.colours[1].raised(rows))
     moved = RidgeField(field.stamp, field.left, raised(field.right, rows), colours=colours)
     try:
-        other = _reconstruct(start, moved)
+        other = _reconstruct(start, moved, are_moved=True)
     except InitializationError:
         if found is None:
             raise
@@ -175,8 +175,8 @@ class _Start:
     """What makes the pixels of all these those of the whole image."""
 
 
-def _reconstruct(start: _Start, field: RidgeField) -> Initialization:
-    """The curve of a thread of the left view."""
+def _reconstruct(start: _Start, field: RidgeField, *, are_moved: bool = False) -> Initialization:
+    """The curve of a thread of the left view; `are_moved` as of `refine`."""
     rig, config, infinity = start.rig, start.config, start.rig.disparity_at_infinity
     ridges = start.left, _ridges_of(field, 1, config)
     found = find_thread(field, ridges, start.thread, start.pixel, infinity, config)
@@ -198,7 +198,7 @@ def _reconstruct(start: _Start, field: RidgeField) -> Initialization:
     )
     try:
         curve = _first_curve(_trim(found.pixels, found.left), rig, config)
-        curve, samples, sigma, rows = refine(curve, views, rig)
+        curve, samples, sigma, rows = refine(curve, views, rig, are_moved=are_moved)
     except FloatingPointError as error:
         reason = f"no curve fits both views: {error}"
         raise InitializationError(reason, start.candidates, growth) from None

@@ -18,7 +18,7 @@ _DENSE_ROUNDS = 4
 _FINAL_ROUNDS = 3
 _EVIDENCE_STEPS = 3
 _STIFFEST = 1e9
-_OFF_PX = 0.2
+_OFF_PX = 0.08
 """By how much the rows of two views have to be off, at least, for that to be told from the bunching of
 depth along the epipolar lines: calibrated ones seem to be off by up to 0.05."""
 _SURELY = 4.0
@@ -28,7 +28,7 @@ _ANY_SLIP_PX = 1.0
 
 
 def refine(
-    curve: Nurbs, views: tuple[View, View], rig: StereoRig
+    curve: Nurbs, views: tuple[View, View], rig: StereoRig, *, are_moved: bool = False
 ) -> tuple[Nurbs, Samples, Float64, float]:
     """Gauss-Newton on the crests of both views, as smooth as the evidence says, with few knots.
 
@@ -40,6 +40,8 @@ def refine(
         curve: within a few pixels of the crests, with knots enough for any shape.
         views: left and right.
         rig: the cameras.
+        are_moved: whether the views are on other rows than the calibration says, so that none of them
+            is to be believed.
 
     Returns:
         The curve, what the images show beside it, (k,) the standard deviations of its samples, and
@@ -50,7 +52,8 @@ def refine(
     """
     start = _Fit(curve, np.array([1.0, 100.0]))
     fit = start.improved(views, rig, _DENSE_ROUNDS)
-    if abs(fit.slip_px) > max(_OFF_PX, _SURELY * fit.slip_sigma_px):
+    off_px = 0.0 if are_moved else _OFF_PX
+    if abs(fit.slip_px) > max(off_px, _SURELY * fit.slip_sigma_px):
         fit = replace(fit, is_level=False).improved(views, rig, _DENSE_ROUNDS)
     fit = replace(fit, curve=with_needed_knots(fit.samples(views, rig)))
     fit = fit.improved(views, rig, _FINAL_ROUNDS)
