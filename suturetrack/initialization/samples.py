@@ -105,7 +105,7 @@ class Samples:
 
     @property
     def variance(self) -> float:
-        """Of the noise of the offsets from curve to crest, px^2."""
+        """Of the noise in the offsets from curve to crest, px^2; at least what no crest goes below."""
         squares = sum((c.trust * c.offsets**2).sum() for c in self.crests)
         mean = squares / max(sum(c.trust.sum() for c in self.crests), 1e-9)
         return max(_NOISE * float(mean), _LEAST_NOISE_PX**2)
