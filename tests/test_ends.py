@@ -9,7 +9,7 @@ from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.end_watch import EndWatch
-from suturetrack.tracking.ends import EndStep, end_shift, find_end
+from suturetrack.tracking.ends import EndStep, end_shifts, find_ends
 from suturetrack.tracking.energies import measure_levels
 from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.images import Images
@@ -44,8 +44,7 @@ def test_ends_are_found_without_bias_in_what_the_filter_shows() -> None:
         field = segmenter.step(frame)
         curve = curve_through(scene.truth(0)[0].points)
         images = Images(field, scene.rig, measure_levels(curve, field, scene.rig))
-        for end in (0, 1):
-            found = find_end(curve, end, images)
+        for found in find_ends(curve, images):
             assert found is not None
             offsets.append(found.offset_px)
     assert np.abs(offsets).max() < 1.0
@@ -65,7 +64,7 @@ def test_something_wider_that_goes_on_behind_an_end_is_told_from_a_hole(
     field = paint(rig, [truth, *bundle], 0, noise=0.0)
     curve = curve_through(truth)
     images = Images(field, rig, measure_levels(curve, field, rig))
-    start, stop = (find_end(curve, end, images) for end in (0, 1))
+    start, stop = find_ends(curve, images)
     assert start is not None
     assert stop is not None
     assert (start.widens, stop.widens) == (False, widens)
@@ -84,8 +83,7 @@ def test_the_views_tell_the_depth_of_ends_that_run_along_an_epipolar_line() -> N
     guess = curve_through(along_a_row(rig, (197.0, 202.0)))
     field = paint(rig, [truth], 0, noise=0.0)
     images = Images(field, rig, measure_levels(curve_through(truth), field, rig))
-    for end in (0, 1):
-        told = end_shift(guess, end, images)
+    for end, told in enumerate(end_shifts(guess, images)):
         assert told is not None
         shift, row = told
         assert abs(shift) > 1.0

@@ -223,8 +223,8 @@ def test_a_thread_that_moves_across_itself_is_expected_to_fade(rig: StereoRig) -
     samples, images = Samples.of(curve.knots, 5), Images(paint(rig, [], 0), rig, (0.8, 0.4))
 
     def response(move: tuple[float, float]) -> tuple[float, float]:
-        moved = replace(curve, control_points=curve.control_points + np.array([*move, 0.0]))
-        left, right = expected(curve, moved, samples, images)
+        moved = samples.views(rig, curve.control_points + np.array([*move, 0.0]))
+        left, right = expected(curve, samples, moved, images)
         return float(left.mean()), float(right.mean())
 
     assert response((2.0, 0.0)) == pytest.approx((0.8, 0.4))

@@ -42,6 +42,8 @@ class Bends:
         bends, learned = _bends(points), 1.0 - math.exp(-max(seconds, 0.0) / _OF_LATE_S)
         last = bends if self._of_late is None else self._of_late
         self._of_late = last + learned * (bends - last)
+        if evidence.evenly_seen.all():
+            return False
         near = maximum_filter1d(self._of_late, 2 * _SLIDES + 1)
         sharper = bends - near - np.maximum(_SHARPER, _TIGHTER * near)
         inner = slice(_CHORD, -_CHORD)

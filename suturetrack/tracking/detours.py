@@ -52,7 +52,7 @@ def led_back(
     """
     found = None
     now = fitted(curve, others)
-    for stretch in _crowded_stretches(now, rig):
+    for stretch in _crowded_stretches(now):
         tried, beside = _bridged(now.fit.curve, stretch), _with_stretch(others, now, stretch, rig)
         for _ in range(_ROUNDS):
             tried = fitted(tried, beside).fit.curve
@@ -62,10 +62,10 @@ def led_back(
     return found
 
 
-def _crowded_stretches(evidence: Evidence, rig: StereoRig) -> Iterator[Stretch]:
+def _crowded_stretches(evidence: Evidence) -> Iterator[Stretch]:
     """Where the curve runs beside other ridges, clear of its ends."""
     samples, crowded = evidence.fit.samples, evidence.fit.crowd.others
-    along = np.cumsum(evidence.fit.views(rig)[0].speed * samples.share)
+    along = np.cumsum(evidence.fit.both[0].speed * samples.share)
     edges = np.flatnonzero(np.diff(np.r_[False, crowded, False]))
     for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
         margin = _WIDER * (samples.s[last] - samples.s[first]) + _MARGIN

@@ -8,7 +8,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.kernels import search
 from suturetrack.polylines import arc_lengths
 from suturetrack.tracking.reliability import ASTRAY, EVENLY, RELIABILITY_SAMPLES
-from suturetrack.tracking.sampling import values_at, views_at
+from suturetrack.tracking.sampling import views_at
 from suturetrack.types import Bool, Float64, Nurbs
 
 # What is not seen may leave the curve by this part of its own motion in a field, and by so much at rest.
@@ -50,18 +50,21 @@ class Drift:
         self, before: Nurbs, predicted: Nurbs, after: Nurbs, seen: Bool, rig: StereoRig
     ) -> None:
         """One field later, in which the curve moved from `before` to `after`."""
-        s, both = EVENLY, views_at(rig, after, EVENLY)
-        last, expected = (rig.project(values_at(curve, s))[0] for curve in (before, predicted))
-        places = both[0].pixels
-        outside = ~np.all([view.inside(rig.image_size, _BORDER_PX) for view in both], axis=0)
-        moved, surprise = (_own_lengths(places - place, seen) for place in (last, expected))
+        left, right = views_at(rig, after, EVENLY)
+        size, was_outside = rig.image_size, self.outside
+        self.outside = ~(left.inside(size, _BORDER_PX) & right.inside(size, _BORDER_PX))
+        if seen.all():
+            self.px = np.zeros(len(seen))
+            return
+        last, expected = (views_at(rig, curve, EVENLY)[0] for curve in (before, predicted))
+        moved, surprise = (
+            _own_lengths(left.pixels - view.pixels, seen) for view in (last, expected)
+        )
         if seen.any():
-            surprise = np.interp(s, s[seen], surprise[seen])
+            surprise = np.interp(EVENLY, EVENLY[seen], surprise[seen])
         step = _DRIFT * moved + surprise + _DRIFT_AT_REST_PX
-        comes_in = self.outside & ~outside
-        farthest = np.minimum(np.hypot(self.px, step), _BULGE * _from_held(seen, places))
-        self.px = np.where(seen | comes_in, 0.0, farthest)
-        self.outside = outside
+        farthest = np.minimum(np.hypot(self.px, step), _BULGE * _from_held(seen, left.pixels))
+        self.px = np.where(seen | (was_outside & ~self.outside), 0.0, farthest)
 
     def cut(self, start: int, stop: int) -> None:
         """So many samples were cut off at the ends."""

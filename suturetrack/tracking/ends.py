@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -53,19 +54,37 @@ class EndStep:
         return self.offset_px * self.pixel
 
 
-def find_end(curve: Nurbs, end: int, images: Images) -> EndStep | None:
-    """Looks for the step of the response at the end `end` (0 or 1), in both images at once.
+@dataclass(frozen=True, eq=False)
+class _Tip:
+    """An end of the curve, what goes on beyond it, and what the images show there."""
+
+    x: Float64
+    """(k,) px beyond the end."""
+    outward: float
+    """Px outwards per unit of s."""
+    both: tuple[View, View]
+    """The curve at these places, left and right."""
+    responses: Float64
+    """(2, k) left and right, of a clear view of the thread."""
+
+
+def find_ends(curve: Nurbs, images: Images) -> tuple[EndStep | None, EndStep | None]:
+    """Looks for the step of the response at the start and at the stop, in both images at once.
 
     None where there is no thread near the end.
     """
-    scale, x, both, responses = _profiles(curve, end, images)
+    start, stop = (_find_end(tip, images) for tip in _tips(curve, images))
+    return start, stop
+
+
+def _find_end(tip: _Tip, images: Images) -> EndStep | None:
+    x, both, (left, right) = tip.x, tip.both, tip.responses
     inside = both[0].inside(images.rig.image_size) & both[1].inside(images.rig.image_size)
     if np.count_nonzero(inside) < _SMOOTHED:
         return None
-    left, right = responses
     narrow_left, narrow_right = (
         response * narrowness(image, view.pixels, view.tangents, x)
-        for image, view, response in zip(images.both, both, responses, strict=True)
+        for image, view, response in zip(images.both, both, tip.responses, strict=True)
     )
     profiles = (left + right) / 2, np.minimum(left, right), (narrow_left + narrow_right) / 2
     x, (mean, least, alone) = x[inside], _smooth(np.stack(profiles)[:, inside])
@@ -75,44 +94,56 @@ def find_end(curve: Nurbs, end: int, images: Images) -> EndStep | None:
     widens = widens_at(x, alone, level)
     boundary = before_a_hole(widens, found)
     at_border = not inside.all() and boundary > x[-1] - 3
-    return EndStep(boundary, 1 / scale, at_border, widens=widens < boundary)
+    return EndStep(boundary, 1 / abs(tip.outward), at_border, widens=widens < boundary)
 
 
-def end_shift(curve: Nurbs, end: int, images: Images) -> tuple[float, Float64] | None:
-    """By how much further the right view shows the thread at the end `end` (0 or 1) than the left.
+def end_shifts(curve: Nurbs, images: Images) -> list[tuple[float, Float64] | None]:
+    """By how much further the right view shows the thread at the start, and at the stop, than the left.
 
-    It tells the depth of the end where the thread runs along an epipolar line.
+    It tells the depth of an end where the thread runs along an epipolar line.
 
     Returns:
-        The difference in px along the curve, and its (3,) derivative by the place of the end; None
-        where the views do not both show the end.
+        For each end the difference in px along the curve, and its (3,) derivative by the place of the
+        end; None where the views do not both show the end.
     """
-    scale, x, both, responses = _profiles(curve, end, images)
-    tip = int(np.searchsorted(x, 0.0))
+    return [_end_shift(tip, images) for tip in _tips(curve, images)]
+
+
+def _end_shift(tip: _Tip, images: Images) -> tuple[float, Float64] | None:
+    at_end = int(np.searchsorted(tip.x, 0.0))
     shown, rows = [], []
-    for view, response in zip(both, _smooth(np.stack(responses)), strict=True):
-        found, _ = outer_boundary(x, response, response)
+    for view, response in zip(tip.both, _smooth(tip.responses), strict=True):
+        found, _ = outer_boundary(tip.x, response, response)
         # Not where it is nan, either.
         if not (view.inside(images.rig.image_size).all() and abs(found) <= _SHOWN_PX):
             return None
         shown.append(found)
-        rows.append(view.tangents[tip] @ view.jacobian[tip] / view.speed[tip])
-    outward = scale if end else -scale
-    return shown[1] - shown[0], outward * (rows[1] - rows[0])
+        rows.append(view.tangents[at_end] @ view.jacobian[at_end] / view.speed[at_end])
+    return shown[1] - shown[0], tip.outward * (rows[1] - rows[0])
 
 
-def _profiles(
-    curve: Nurbs, end: int, images: Images
-) -> tuple[float, Float64, tuple[View, View], list[Float64]]:
-    """Px per unit of s, (k,) px beyond the end, the curve there in both images, and their (k,) responses."""
-    scale = _px_per_s(curve, end, images.rig)
-    x = np.arange(-min(_INWARD_PX, 0.5 * scale), _OUTWARD_PX + 0.1, _STEP_PX)
-    both = views(images.rig, *_extension(curve, end, np.asarray(x / scale, np.float64)))
-    responses = [
-        np.minimum(view.responses(image) / level, 1.2)
-        for image, view, level in zip(images.both, both, images.levels, strict=True)
+def _tips(curve: Nurbs, images: Images) -> list[_Tip]:
+    """The start and the stop of the curve."""
+    start, stop = _px_per_s(curve, images.rig)
+    outward = -start, stop
+    x = [
+        np.arange(-min(_INWARD_PX, 0.5 * scale), _OUTWARD_PX + 0.1, _STEP_PX)
+        for scale in (start, stop)
     ]
-    return scale, x, both, responses
+    drawn_out = [_extension(curve, end, x[end] / scale) for end, scale in enumerate((start, stop))]
+    points, first = (np.concatenate(parts) for parts in zip(*drawn_out, strict=True))
+    both = views(images.rig, points, first)
+    responses = np.stack(
+        [
+            np.minimum(view.responses(image) / level, 1.2)
+            for image, view, level in zip(images.both, both, images.levels, strict=True)
+        ]
+    )
+    pieces = slice(len(x[0])), slice(len(x[0]), None)
+    return [
+        _Tip(x[end], outward[end], (both[0][piece], both[1][piece]), responses[:, piece])
+        for end, piece in enumerate(pieces)
+    ]
 
 
 def _smooth(profiles: Float64) -> Float64:
@@ -120,25 +151,24 @@ def _smooth(profiles: Float64) -> Float64:
     return np.asarray(uniform_filter1d(profiles, _SMOOTHED, mode="nearest"))
 
 
-def _px_per_s(curve: Nurbs, end: int, rig: StereoRig) -> float:
-    """Speed of the curve in the images at an end, px per unit of s; at least half of that of the rest."""
+@lru_cache(maxsize=8)
+def _px_per_s(curve: Nurbs, rig: StereoRig) -> tuple[float, float]:
+    """Speed of the curve in the images at its ends, px per unit of s; at least half of that of the rest."""
     left, right = views_at(rig, curve, _ALONG)
     speed = (left.speed + right.speed) / 2
-    at_end = speed[-2:].mean() if end else speed[:2].mean()
-    return max(float(at_end), _FORESHORTENED * float(speed.mean()), 1e-6)
+    least = max(_FORESHORTENED * float(speed.mean()), 1e-6)
+    return max(float(speed[:2].mean()), least), max(float(speed[-2:].mean()), least)
 
 
 def _extension(curve: Nurbs, end: int, beyond: Float64) -> tuple[Float64, Float64]:
     """Points and derivatives at `beyond` past the end: the curve itself, then a parabola."""
     sign = 1.0 if end else -1.0
-    inner = float(end) + sign * np.minimum(beyond, 0.0)
-    outer = np.maximum(beyond, 0.0)[:, None]
-    points, first, _ = derivatives_at(curve, inner)
-    _, slope, second = derivatives_at(curve, float(end) - sign * _BEND)
-    tip, bend = slope[0], second.mean(axis=0)
-    points = points + outer * sign * tip + outer**2 / 2 * bend
-    first = np.where(outer > 0, tip + sign * outer * bend, first)
-    return points, first
+    inner, outer = np.minimum(beyond, 0.0), np.maximum(beyond, 0.0)[:, None]
+    points, first, second = derivatives_at(curve, float(end) + sign * np.r_[-_BEND, inner])
+    tip, bend = first[0], second[: len(_BEND)].mean(axis=0)
+    points, first = points[len(_BEND) :], first[len(_BEND) :]
+    points = points + outer * (sign * tip + outer / 2 * bend)
+    return points, np.where(outer > 0, tip + sign * outer * bend, first)
 
 
 def with_ends(curve: Nurbs, start: float, stop: float) -> Nurbs:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.tracking.sampling import Samples, views, views_at
+from suturetrack.tracking.sampling import Samples, View, views, views_at
 from suturetrack.types import Energies, Float32, Float64, Nurbs, RidgeField
+
+# Pixels of an image that tell the mean of all.
+_SPARSE = 1200
 
 
 def energies(
@@ -30,8 +35,11 @@ def energies(
 
 def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[float, float]:
     """Median response along a curve that lies on the thread, left and right."""
-    samples = Samples.of(curve.knots, 5)
-    both = samples.views(rig, curve.control_points)
+    return levels_along(Samples.of(curve.knots, 5).views(rig, curve.control_points), field)
+
+
+def levels_along(both: tuple[View, View], field: RidgeField) -> tuple[float, float]:
+    """Median response at samples that lie on the thread, left and right."""
     left, right = (
         float(np.median(view.responses(image)))
         for image, view in zip((field.left, field.right), both, strict=True)
@@ -41,7 +49,8 @@ def measure_levels(curve: Nurbs, field: RidgeField, rig: StereoRig) -> tuple[flo
 
 def cutoff(image: Float32, level: float) -> float:
     """|V_c| of eq. (7): midway between the mean magnitudes of the thread and of the background."""
-    sparse = image[::8, ::8]
+    stride = max(math.isqrt(image.shape[0] * image.shape[1] // _SPARSE), 1)
+    sparse = image[::stride, ::stride]
     return (level + float(np.hypot(sparse[..., 0], sparse[..., 1]).mean())) / 2
 
 
@@ -54,7 +63,11 @@ def _end(curve: Nurbs, field: RidgeField, rig: StereoRig, levels: tuple[float, f
 
 
 def _bending(first: Float64, second: Float64, samples: Samples) -> float:
-    speed = np.maximum(np.linalg.norm(first, axis=1), np.finfo(float).tiny)
-    curvature = np.linalg.norm(np.cross(first, second), axis=1) / speed**3
-    length = float(np.sum(speed * samples.share))
-    return length * float(np.sum(curvature**2 * speed * samples.share))
+    squared, along, power = (
+        np.einsum("ij,ij->i", a, b) for a, b in ((first, first), (first, second), (second, second))
+    )
+    squared = np.maximum(squared, np.finfo(float).tiny)
+    lengths = np.sqrt(squared) * samples.share
+    # |f' x f''|^2 by Lagrange's identity.
+    squared_curvature = (squared * power - along**2) / squared**3
+    return float(np.sum(lengths)) * float(np.sum(squared_curvature * lengths))

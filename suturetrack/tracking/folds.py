@@ -41,8 +41,10 @@ def doubled_ends(curve: Nurbs, rig: StereoRig) -> tuple[Tail, Tail]:
     both = samples.views(rig, curve.control_points)
     along = np.cumsum(samples.share * both[0].speed)
     inward = np.arange(0.0, min(_FOLD_PX, along[-1] / 2))
-    start = _fold(curve, rig, 0, np.interp(inward, along, samples.s))
-    stop = _fold(curve, rig, 1, np.interp(along[-1] - inward, along, samples.s))
+    start, stop = (
+        _fold(curve, rig, end, np.interp(way, along, samples.s))
+        for end, way in ((0, inward), (1, along[-1] - inward))
+    )
     tails = _long_tails(samples, both, along)
     return Tail(start, True) if start else tails[0], Tail(stop, True) if stop else tails[1]
 
@@ -53,8 +55,12 @@ def _fold(curve: Nurbs, rig: StereoRig, end: int, inward: Float64) -> float:
     `inward` are parameters a pixel apart that begin at that end.
     """
     both = views_at(rig, curve, inward)
-    near, cosines = _compared(both, np.arange(min(_TIP, len(inward))))
-    tip, there = np.nonzero(near & (cosines.max(axis=0) < _OPPOSED))
+    rows = np.arange(min(_TIP, len(inward)))
+    left, right = (view.tangents[rows] @ view.tangents.T for view in both)
+    opposed = np.maximum(left, right) < _OPPOSED
+    if not opposed.any():
+        return 0.0
+    tip, there = np.nonzero(opposed & _near(both, rows))
     if not len(tip):
         return 0.0
     return abs(end - float(inward[(tip + there).max() // 2]))
@@ -66,9 +72,11 @@ def _long_tails(samples: Samples, both: tuple[View, View], along: Float64) -> tu
     def back_at(rows: Int64) -> Float64:
         """(r,) px along the curve from samples to the nearest one that they lie on; inf for none."""
         gap = np.abs(along - along[rows, None])
-        near, cosines = _compared(both, rows)
-        parallel = np.abs(cosines).min(axis=0) > _PARALLEL
-        return np.where(near & parallel & (gap >= _TURN_PX), gap, np.inf).min(axis=1)
+        lies_on = _near(both, rows) & (gap >= _TURN_PX)
+        if lies_on.any():
+            for view in both:
+                lies_on &= np.abs(view.tangents[rows] @ view.tangents.T) > _PARALLEL
+        return np.where(lies_on, gap, np.inf).min(axis=1)
 
     if not np.isfinite(back_at(_TIPS)).any():
         return Tail(0.0, False), Tail(0.0, False)
@@ -82,12 +90,12 @@ def _long_tails(samples: Samples, both: tuple[View, View], along: Float64) -> tu
     )
 
 
-def _compared(both: tuple[View, View], rows: Int64) -> tuple[Bool, Float64]:
-    """(r, k) whether the samples `rows` lie on others in both images, and (2, r, k) cosines to them."""
-    pixels = np.stack([view.pixels for view in both])
-    tangents = np.stack([view.tangents for view in both])
-    apart = np.abs(pixels[:, rows, None] - pixels[:, None]).max(axis=(0, 3))
-    return apart <= _ON_PX, tangents[:, rows] @ tangents.transpose(0, 2, 1)
+def _near(both: tuple[View, View], rows: Int64) -> Bool:
+    """(r, k) whether the samples `rows` lie where others do, in both images."""
+    near = np.ones((len(rows), len(both[0].pixels)), bool)
+    for places in (column for view in both for column in view.pixels.T):
+        near &= np.abs(places[rows, None] - places) <= _ON_PX
+    return near
 
 
 def _doubled(back: Float64, along: Float64) -> tuple[int, bool]:

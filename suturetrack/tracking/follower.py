@@ -19,8 +19,8 @@ from suturetrack.tracking.crowding import covered
 from suturetrack.tracking.detours import led_back
 from suturetrack.tracking.drift import Drift, HiddenEnds
 from suturetrack.tracking.end_watch import EndWatch
-from suturetrack.tracking.ends import EndStep, find_end, with_ends
-from suturetrack.tracking.energies import cutoff, energies, measure_levels
+from suturetrack.tracking.ends import EndStep, find_ends, with_ends
+from suturetrack.tracking.energies import cutoff, energies, levels_along, measure_levels
 from suturetrack.tracking.fitting import fit_widely
 from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.images import Images
@@ -190,13 +190,13 @@ class Follower:
         self._seen = evidence.evenly_seen
         if evidence.share >= MOST:
             model.seen_ns = model.capture_ns
-            self._learn_levels(field)
+            self._learn_levels(levels_along(evidence.fit.both, field))
             images = replace(images, levels=model.levels)
         if not self._held.any():
             self._free_ns = model.capture_ns
         if inserted or removed:
             events.append(f"control points: {inserted} inserted, {removed} removed")
-        astray, plain = evidence.astray(images, neighbours)
+        astray, plain = evidence.astray(images, neighbours), evidence.plain(neighbours)
         status = self._judge(evidence, astray, plain, seconds)
         return self._state(field, thread, evidence, status, events)
 
@@ -376,7 +376,7 @@ class Follower:
         model.curve = best.without_half_seen_tips() if self._leaps.any() else best.fit.curve
         self._leaps = np.zeros(2, bool)
         if best.share > 0.3:
-            known = covered(best.fit.views(self.rig), neighbours)
+            known = covered(best.fit.both, neighbours)
             cut = length_of(best.fit.curve) / length_of(model.curve) - 1.0
             self._adjust_ends(images, best.fit.crowd.others, known, cut)
         self._cut_doubled_ends()
@@ -420,7 +420,7 @@ class Follower:
         rested_s = (model.capture_ns - self._regrown_ns) * _NS
         if not known.is_established or 0 <= rested_s < _REGROWN_S:
             return evidence
-        tails = loose_tails(evidence.astray(images, neighbours)[1])
+        tails = loose_tails(evidence.plain(neighbours))
         if not tails:
             return evidence
         self._regrown_ns = model.capture_ns
@@ -471,9 +471,11 @@ class Follower:
             cut: what tips were cut off to be found anew, as a part of the length that is left.
         """
         model = self.model
+        tips = slice(_TIP), slice(-_TIP, None)
+        shown = find_ends(model.curve, images)
         steps = [
-            self._end_step(end, images, bool(crowded[tip].any()), bool(known[tip].any()))
-            for end, tip in enumerate((slice(_TIP), slice(-_TIP, None)))
+            self._end_step(end, shown[end], bool(crowded[tip].any()), bool(known[tip].any()))
+            for end, tip in enumerate(tips)
         ]
         start, stop = model.ends.moves(
             steps[0],
@@ -492,17 +494,15 @@ class Follower:
         )
 
     def _end_step(
-        self, end: int, images: Images, crowded: bool, on_another: bool
+        self, end: int, step: EndStep | None, crowded: bool, on_another: bool
     ) -> EndStep | None:
-        model, now_ns = self.model, images.field.stamp.capture_ns
-        step = find_end(model.curve, end, images)
+        model = self.model
         alone = not (crowded or on_another)
         step = step and replace(step, alone=alone, on_another=on_another)
         other = self._mouths[1 - end]
-        return self._mouths[end].steady(step, model.curve, end, other, self.rig, now_ns)
+        return self._mouths[end].steady(step, model.curve, end, other, self.rig, model.capture_ns)
 
-    def _learn_levels(self, field: RidgeField) -> None:
-        now = measure_levels(self.model.curve, field, self.rig)
+    def _learn_levels(self, now: tuple[float, float]) -> None:
         old = self.model.levels
         self.model.levels = (0.8 * old[0] + 0.2 * now[0], 0.8 * old[1] + 0.2 * now[1])
 

@@ -12,15 +12,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
-from suturetrack.camera import StereoRig
 from suturetrack.kernels import rows, search, spline
 from suturetrack.nurbs import curve_from
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.crowding import Crowd, crowded
-from suturetrack.tracking.ends import end_shift
+from suturetrack.tracking.ends import end_shifts
 from suturetrack.tracking.images import Images
-from suturetrack.tracking.sampling import Samples, View, resampled, views
+from suturetrack.tracking.sampling import Samples, View, resampled
 from suturetrack.tracking.strands import NOBODY, SAME_STRAND_PX, Neighbours, Strand
 from suturetrack.types import Bool, Float32, Float64, Nurbs
 
@@ -74,16 +74,14 @@ class Fit:
 
     curve: Nurbs
     samples: Samples
+    both: tuple[View, View]
+    """The samples on the curve, left and right."""
     residual: Float64
     """(k, 2) px between the curve and what was found, left and right; nan where nothing was."""
     covariance: Float64
     """(k, 3, 3) of the samples' positions."""
     crowd: Crowd
     """Where other ridges run close beside the thread."""
-
-    def views(self, rig: StereoRig) -> tuple[View, View]:
-        """The samples on the fitted curve, in both images."""
-        return self.samples.views(rig, self.curve.control_points)
 
 
 def search_normals(
@@ -123,16 +121,17 @@ def fit(
     samples = Samples.of(predicted.knots, config.samples_per_span)
     reference = _Reference.of(samples, predicted)
     control_points = predicted.control_points
-    crowd = _crowd(predicted, samples, images, neighbours)
+    both = samples.views(images.rig, control_points)
+    crowd = crowded(both, samples.share, images, neighbours)
     if sprung is not None:
         crowd = replace(crowd, others=crowd.others | resampled(sprung, samples.s))
     surprise: Float64 | None = None
-    tips = [end_shift(predicted, end, images) for end in (0, 1)]
-    faded = expected(before, predicted, samples, images)
+    tips = end_shifts(predicted, images)
+    faded = expected(before, samples, both, images)
     reach, outlier = reach_px, math.inf
     rounds = config.iterations + round(math.log2(max(reach_px / config.search_px, 1.0)))
     for _ in range(rounds):
-        linear = _Linearized(samples, control_points, images, faded, reach, neighbours)
+        linear = _Linearized(samples, control_points, both, images, faded, reach, neighbours)
         surprise = linear.surprise(crowd) if surprise is None else surprise
         equations = linear.equations(reference, faded, config, outlier, crowd, surprise)
         equations.add_tips(tips, predicted.control_points - control_points)
@@ -140,13 +139,14 @@ def fit(
         if known_length is not None:
             step = linear.keeping_length(step, equations, known_length)
         control_points = control_points + step
-        pixels = images.rig.project(samples.values(control_points))
-        if math.isfinite(outlier) and linear.is_near(pixels):
+        both = samples.views(images.rig, control_points)
+        if math.isfinite(outlier) and linear.is_near(both):
             break
         outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
         reach = max(reach / 2, _REFINED_PX)
     curve = curve_from(spline.DEGREE, predicted.knots, control_points)
-    return Fit(curve, samples, _residual(pixels, linear), equations.covariance(samples), crowd)
+    covariance = equations.covariance(samples)
+    return Fit(curve, samples, both, _residual(both, linear), covariance, crowd)
 
 
 def observe(
@@ -154,26 +154,28 @@ def observe(
 ) -> Fit:
     """What the field says about a curve that something else has fitted."""
     samples = Samples.of(curve.knots, config.samples_per_span)
-    still = expected(curve, curve, samples, images)
-    crowd = _crowd(curve, samples, images, neighbours)
-    linear = _Linearized(samples, curve.control_points, images, still, _REFINED_PX, neighbours)
+    control_points = curve.control_points
+    both = samples.views(images.rig, control_points)
+    still = expected(curve, samples, both, images)
+    crowd = crowded(both, samples.share, images, neighbours)
+    linear = _Linearized(samples, control_points, both, images, still, _REFINED_PX, neighbours)
     reference, surprise = _Reference.of(samples, curve), linear.surprise(crowd)
     equations = linear.equations(reference, still, config, _OUTLIER_PX, crowd, surprise)
     equations.solve()
-    residual = _residual([view.pixels for view in linear.views], linear)
-    return Fit(curve, samples, residual, equations.covariance(samples), crowd)
-
-
-def _crowd(curve: Nurbs, samples: Samples, images: Images, neighbours: Neighbours) -> Crowd:
-    both = samples.views(images.rig, curve.control_points)
-    return crowded(both, samples.share, images, neighbours)
+    return Fit(curve, samples, both, _residual(both, linear), equations.covariance(samples), crowd)
 
 
 def expected(
-    before: Nurbs, after: Nurbs, samples: Samples, images: Images
+    before: Nurbs, samples: Samples, both: tuple[View, View], images: Images
 ) -> tuple[Float64, Float64]:
-    """(k,) the response of the thread left and right where it moves, which smears it."""
-    both = samples.views(images.rig, after.control_points)
+    """(k,) the response of the thread left and right where it moves, which smears it.
+
+    Args:
+        before: the curve in the last field.
+        samples: where it is asked for.
+        both: the samples in this field.
+        images: what shows it.
+    """
     last = images.rig.project(samples.values(before.control_points))
     left, right = (
         level * np.maximum(1 / (1 + (_across(view, pixels) / _SMEARED_PX) ** 4), _LEAST_FADING)
@@ -183,7 +185,8 @@ def expected(
 
 
 def _across(view: View, pixels: Float64) -> Float64:
-    return np.asarray(np.sum((view.pixels - pixels) * view.normals, axis=1))
+    """(k,) px along the normals from (k, 2) pixels to the samples."""
+    return np.einsum("ij,ij->i", view.pixels - pixels, view.normals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +213,7 @@ class _Linearized:
         self,
         samples: Samples,
         control_points: Float64,
+        both: tuple[View, View],
         images: Images,
         levels: tuple[Float64, Float64],
         reach_px: float,
@@ -219,7 +223,7 @@ class _Linearized:
         self.points, self.first, self.second = (
             samples.values(control_points, times) for times in range(3)
         )
-        self.views = views(images.rig, self.points, self.first)
+        self.views = both
         left, right = (
             search_normals(image, view, samples.share, level, reach_px, others)
             for image, view, level, others in zip(
@@ -326,10 +330,11 @@ class _Linearized:
         doubt = _LENGTH_DOUBT * known * (1 + (lacking / (_LENGTH_OUTLIER * known)) ** 2)
         return step + lacking / (doubt**2 + float(np.sum(row * moved))) * moved
 
-    def is_near(self, pixels: tuple[Float64, Float64]) -> bool:
-        """Whether the samples, which are at these pixels now, have hardly moved."""
-        both = zip(pixels, self.views, strict=True)
-        return max(float(np.abs(moved - view.pixels).max()) for moved, view in both) < _SETTLED_PX
+    def is_near(self, moved: tuple[View, View]) -> bool:
+        """Whether the samples, which are there now, have hardly moved."""
+        both = zip(moved, self.views, strict=True)
+        steps = (float(np.abs(now.pixels - view.pixels).max()) for now, view in both)
+        return max(steps) < _SETTLED_PX
 
     def surprise(self, crowd: Crowd) -> Float64:
         """(k,) px by which the thread has left the curve where it is alone, and so in between."""
@@ -337,8 +342,7 @@ class _Linearized:
         away, either, s = np.maximum(left, right), ~(crowd.others | self._hidden), self.samples.s
         if not either.any():
             return np.ones(len(s))
-        padded = np.pad(away[either], _SMOOTH // 2, mode="edge")
-        smooth = np.convolve(padded, np.full(_SMOOTH, 1 / _SMOOTH), "valid")
+        smooth = uniform_filter1d(away[either], _SMOOTH, mode="nearest")
         return np.asarray(_LEAST_SURPRISE_PX + np.interp(s, s[either], smooth))
 
 
@@ -352,7 +356,7 @@ class _Equations:
         """Rows for what the views show differently at the ends.
 
         Args:
-            tips: of `end_shift`, of the predicted curve's start and stop.
+            tips: of `end_shifts`, of the predicted curve's start and stop.
             back: (n + 1, 3) from the control points to the predicted ones.
         """
         for end, tip in zip((0, -1), tips, strict=True):
@@ -392,10 +396,10 @@ def _norm(vectors: Float64) -> Float64:
     return np.asarray(np.maximum(np.sqrt(squared), np.finfo(float).tiny))
 
 
-def _residual(pixels: Sequence[Float64], linear: _Linearized) -> Float64:
-    """(k, 2) what is left of the offsets once the samples have moved to `pixels`."""
-    columns = []
-    for moved, view, found in zip(pixels, linear.views, linear.offsets, strict=True):
-        gone = np.sum((moved - view.pixels) * view.normals, axis=1)
-        columns.append(np.where(found.found, found.offset - gone, np.nan))
+def _residual(moved: tuple[View, View], linear: _Linearized) -> Float64:
+    """(k, 2) what is left of the offsets once the samples have moved there."""
+    columns = [
+        np.where(found.found, found.offset + _across(view, now.pixels), np.nan)
+        for now, view, found in zip(moved, linear.views, linear.offsets, strict=True)
+    ]
     return np.stack(columns, axis=1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from suturetrack.camera import StereoRig
-from suturetrack.kernels import spline
+from suturetrack.kernels import rows, spline
 from suturetrack.nurbs import clamped_knots, curve_from
 from suturetrack.tracking.sampling import Samples, derivatives_at, greville, values_at, views
 from suturetrack.types import Bool, Float64, Nurbs
@@ -64,14 +64,15 @@ class Motion:
             return Motion.none()
         points, first, _ = derivatives_at(after, _PLACES)
         moved = points - values_at(before, _PLACES)
-        information = np.zeros((len(_PLACES), 3, 3))
+        told = seen[np.round(_PLACES * (len(seen) - 1)).astype(int)].astype(float)
+        information, no_pull = np.zeros((len(_PLACES), 3, 3)), np.zeros_like(moved)
         for view in views(rig, points, first):
-            row = (view.normals[:, None, :] @ view.jacobian)[:, 0, :]
-            information += row[:, :, None] * row[:, None, :]
+            rows.add_measured_rows(
+                view.tangents, view.jacobian, told, np.zeros_like(told), information, no_pull
+            )
             for end, end_seen in ((0, ends_seen[0]), (-1, ends_seen[1])):
-                if end_seen:
+                if end_seen and told[end]:
                     information[end] += view.jacobian[end].T @ view.jacobian[end]
-        information *= seen[np.round(_PLACES * (len(seen) - 1)).astype(int), None, None]
         measured = _fit(information, moved / seconds)
         share = float(seen.mean())
         kept = self.coefficients * np.exp(-(1 - share) * seconds / _FADING_S)

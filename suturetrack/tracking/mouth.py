@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from suturetrack.camera import StereoRig
@@ -95,8 +97,8 @@ class Mouth:
         """How far from the mean place the end shows, px: the images tell little of its depth."""
         if self._place is None:
             return np.inf
-        both = zip(rig.project(shown), rig.project(self._place), strict=True)
-        return max(float(np.linalg.norm(a - b)) for a, b in both)
+        left, right = rig.project(np.concatenate([shown, self._place]))
+        return max(math.dist(*left), math.dist(*right))
 
     def _has_left(self, away: float, now_ns: int) -> bool:
         if self.is_open:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from suturetrack import nurbs
 from suturetrack.tracking.control_points import rearrange
-from suturetrack.tracking.ends import find_end, with_ends
+from suturetrack.tracking.ends import find_ends, with_ends
 from suturetrack.tracking.images import Images
 from suturetrack.tracking.length import KnownLength
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES, Evidence, loose_ends
@@ -67,7 +67,7 @@ def _grown(
 ) -> Evidence | None:
     """The curve drawn out along the ridge at an end, and over what crosses it; None if there is none."""
     evidence = None
-    step = find_end(curve, end, images)
+    step = find_ends(curve, images)[end]
     for _ in range(_STEPS):
         if step is None:
             break
@@ -75,7 +75,7 @@ def _grown(
         ahead = step.pixel * (_LEAP_PX if is_leap else step.offset_px)
         start, stop = (0.0, ahead) if end else (ahead, 0.0)
         longer = fitted(rearrange(with_ends(curve, -start, 1.0 + stop), images.rig)[0])
-        step = find_end(longer.fit.curve, end, images)
+        step = find_ends(longer.fit.curve, images)[end]
         if is_leap and (step is None or step.offset_px < -_LEAST_PX):
             break
         evidence, curve = longer, longer.fit.curve

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -95,28 +95,26 @@ class Evidence:
         """Whether nearly all of the thread is plain to see, with no other ridge beside it."""
         return bool((plain & self.alone).mean() > _CLEARLY)
 
-    def astray(self, images: Images, neighbours: Neighbours) -> tuple[Bool, Bool]:
-        """(k,) whether the curve has left the thread, and whether it is plainly on it.
+    def plain(self, neighbours: Neighbours) -> Bool:
+        """(K,) whether the curve is plainly on the thread, at evenly spaced parameters: it is seen, and lies
+        on no other strand."""
+        left, right = (double for _, double in _strands_seen(self, neighbours))
+        return self._even(self.seen & ~(left | right))
 
-        It has left where both images show a thread beside a stretch that is unseen; and where it lies
-        on another strand in an image, with a strand beside it that is nobody's. It is plainly on the
-        thread where it is seen and lies on no other strand.
+    def astray(self, images: Images, neighbours: Neighbours) -> Bool:
+        """(K,) whether the curve has left the thread, at evenly spaced parameters.
+
+        It has where both images show a thread beside a stretch that is unseen; and where it lies on
+        another strand in an image, with a strand beside it that is nobody's.
         """
-        both, share = self.fit.views(images.rig), self.fit.samples.share
-        unseen, left_alone, plain = ~self.seen, np.zeros(len(self.seen), bool), self.seen.copy()
-        for image, view, level, others in zip(
-            images.both, both, images.levels, neighbours.both, strict=True
+        unseen, left_alone = ~self.seen, np.zeros(len(self.seen), bool)
+        shown = _strands_seen(self, neighbours)
+        for image, view, level, (strands, double) in zip(
+            images.both, self.fit.both, images.levels, shown, strict=True
         ):
-            own = Strand.of(view, share)
-            all_seen = own.where(self.seen).joined(others)
-            on_another = search.doubled(
-                own.arrays, all_seen.arrays, SAME_STRAND_PX, search.APART_PX
-            )
-            double = self.seen & on_another
-            unseen &= _beside(image, view, unseen, all_seen, _BESIDE_PX, _NOT_OWN_PX, level)
-            left_alone |= _beside(image, view, double, all_seen, _NEXT_PX, _NOT_TAKEN_PX, level)
-            plain &= ~double
-        return self._even(unseen | left_alone), self._even(plain)
+            unseen &= _beside(image, view, unseen, strands, _BESIDE_PX, _NOT_OWN_PX, level)
+            left_alone |= _beside(image, view, double, strands, _NEXT_PX, _NOT_TAKEN_PX, level)
+        return self._even(unseen | left_alone)
 
     def _even(self, flags: Bool) -> Bool:
         return flags[self._nearest]
@@ -125,6 +123,18 @@ class Evidence:
     def _nearest(self) -> Int64:
         s = self.fit.samples.s
         return np.clip(np.searchsorted(s, EVENLY), 0, len(s) - 1)
+
+
+@lru_cache(maxsize=2)
+def _strands_seen(evidence: Evidence, neighbours: Neighbours) -> tuple[tuple[Strand, Bool], ...]:
+    """What each view shows of the thread and of others, and (k,) which seen samples lie on another strand."""
+    shown = []
+    for view, others in zip(evidence.fit.both, neighbours.both, strict=True):
+        own = Strand.of(view, evidence.fit.samples.share)
+        strands = own.where(evidence.seen).joined(others)
+        double = search.doubled(own.arrays, strands.arrays, SAME_STRAND_PX, search.APART_PX)
+        shown.append((strands, evidence.seen & double))
+    return tuple(shown)
 
 
 def _beside(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import search, spline
 from suturetrack.types import Bool, Float32, Float64, Int64, Nurbs
+
+_QUARTER_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +64,16 @@ class View:
     jacobian: Float64
     """(k, 2, 3) derivative of the pixel."""
 
+    def __getitem__(self, which: slice) -> View:
+        """A run of the samples."""
+        return View(
+            self.pixels[which], self.tangents[which], self.speed[which], self.jacobian[which]
+        )
+
     @property
     def normals(self) -> Float64:
         """(k, 2) unit normals, the tangents turned by +90 degrees."""
-        return np.stack([-self.tangents[:, 1], self.tangents[:, 0]], axis=1)
+        return self.tangents @ _QUARTER_TURN
 
     def responses(self, image: Float32) -> Float64:
         """(k,) responses of an (H, W, 2) field, eq. (4)'s integrand."""
@@ -85,11 +94,9 @@ class View:
 
 def views(rig: StereoRig, points: Float64, derivatives: Float64) -> tuple[View, View]:
     """Both images of (k, 3) points with their derivatives by s."""
-    left, right = (
-        View(*spline.project_samples(camera.projection, points, derivatives))
-        for camera in (rig.left, rig.right)
-    )
-    return left, right
+    left = spline.project_samples(rig.left.projection, points, derivatives)
+    right = spline.project_samples(rig.right.projection, points, derivatives)
+    return View(*left), View(*right)
 
 
 def views_at(rig: StereoRig, curve: Nurbs, s: Float64) -> tuple[View, View]:
@@ -108,6 +115,7 @@ def derivatives_at(curve: Nurbs, s: Float64) -> Float64:
     return spline.evaluate(s, curve.knots, curve.control_points)
 
 
+@lru_cache(maxsize=32)
 def length_of(curve: Nurbs) -> float:
     """Arc length of a cubic curve, by quadrature on each knot span."""
     return float(spline.arc_length(curve.knots, curve.control_points))

@@ -34,9 +34,11 @@ def sprung_in_depth(before: Nurbs, after: Nurbs, rig: StereoRig, held: Bool) -> 
     was, now = (_disparities(rig, curve) for curve in (before, after))
     step = now - was
     away = np.abs(step - median_filter(step, len(step) // 2, mode="nearest"))
+    sprung = np.zeros(len(away), bool)
+    if away.max() <= _SPRING_PX:
+        return sprung
     bound = max(_SPRING_PX, _ABOVE_MOST * float(np.percentile(away, _MOST_PERCENT)))
     runs, count = label(away > bound / 2)
-    sprung = np.zeros(len(away), bool)
     for run in (runs == place for place in range(1, count + 1)):
         around = binary_dilation(run, iterations=_AROUND)[_CHORD:-_CHORD]
         bent = [float(np.sum(_second_differences(line)[around] ** 2)) for line in (was, now)]
