@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Group
@@ -36,7 +36,7 @@ class StatusConfig:
     zenoh: Path | None = None
     """The Zenoh configuration file of a rig on other machines; needs --rig."""
     once: bool = False
-    """Looks once and ends, with status 1 when nothing runs."""
+    """Looks once and ends, with status 1 when nothing runs; as it does where no terminal shows it live."""
 
 
 class RigWatch:
@@ -122,6 +122,7 @@ def run(config: StatusConfig) -> None:
     if config.zenoh is not None and config.rig is None:
         raise InputError("--zenoh needs --rig, the name of the rig behind it")
     console = report_console()
+    config = replace(config, once=config.once or not console.is_terminal)
     watches: dict[str, RigWatch] = {}
     try:
         if config.once:

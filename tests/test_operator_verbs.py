@@ -41,6 +41,7 @@ def test_a_length_without_a_unit_is_refused(text: str) -> None:
         ("grasp --from-end 10mm --fraction 0.5", "exactly one of --from-end, --from-start"),
         ("grasp --from-end 10", "such as 10mm"),
         ("status --once --rig other", "no process of rig 'other' runs"),
+        ("status --rig other", "no process of rig 'other' runs"),
         ("console --port 9999999", "port 9999999: use 1 to 65535, or 0"),
     ],
 )
