@@ -11,10 +11,8 @@ from suturetrack.initialization.doubts import (
     BENT,
     BEYOND,
     CROSSING,
-    FADES,
     FOREIGN,
     HIDDEN,
-    RECOLOURED,
     SHARED,
     SHARP,
     Doubt,
@@ -51,6 +49,8 @@ straight threads before an endoscope (pull-through, 62 starts) 44 of the 50 righ
 _HELD = 0.9
 """What is left of the confidence, at most, where that is a reason to give."""
 _SAME_PLACE_PX = 25.0
+_AROUND_PX = 50.0
+"""How far around a place another strand shows that may lie on the thread at the place itself."""
 _ONE_PASS = 3.0
 """Length of a curve near a place, against the radius, from which it passes there more than once."""
 _BESIDE_PX = 5.0
@@ -226,7 +226,7 @@ def _placed(
         both = max(rest, min(_same(why, there, doubts[1 - view]), default=1.0))
         if why == SHARED or not _is_shared(place, line, counterpart, chains[1 - view].pixels):
             left = rest
-        elif why in (BEYOND, CROSSING, FADES, RECOLOURED, *FOREIGN) and both < _GRAVE:
+        elif why != SHARP and both < _GRAVE:
             left = both
         else:
             left = float(np.sqrt(rest))
@@ -305,11 +305,12 @@ def _is_one_pass(line: Float64, near: Int64) -> bool:
 
 def _is_all_ridge(place: Float64, line: Float64, near: Int64, ridges: Ridges) -> bool:
     points = np.concatenate(ridges.segments)
-    around = points[np.linalg.norm(points - place, axis=1) <= _SAME_PLACE_PX]
-    foreign = around[cKDTree(line).query(around)[0] > _BESIDE_PX]
-    is_end = near[0] == 0 or near[-1] == len(line) - 1
-    level = 0.0 if is_end else _FAINT * float(np.median(ridges.sample(line)))
-    return len(foreign) < _FEW or int((ridges.sample(foreign) > level).sum()) < _FEW
+    apart = np.linalg.norm(points - place, axis=1)
+    is_foreign = (apart <= _AROUND_PX) & (cKDTree(line).query(points)[0] > _BESIDE_PX)
+    is_clear = ridges.sample(points) > _FAINT * float(np.median(ridges.sample(line)))
+    if near[0] == 0 or near[-1] == len(line) - 1:
+        is_clear |= apart <= _SAME_PLACE_PX
+    return int((is_foreign & is_clear).sum()) < _FEW
 
 
 def _bends_sharply(passing: Float64) -> bool:

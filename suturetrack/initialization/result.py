@@ -88,8 +88,13 @@ class Initialization:
 
 
 def remaining(doubts: PlacedDoubts) -> float:
-    """What doubts leave of the confidence: those of the view that has the graver ones count."""
-    return min(math.prod(rest for _, rest in view) for view in doubts)
+    """What doubts leave of the confidence: those of the view that has the graver ones count.
+
+    Of one view the gravest counts in full, the others by their square root: what makes one of them
+    groundless often does so for the others.
+    """
+    left, right = ([rest for _, rest in view] for view in doubts)
+    return min(math.sqrt(math.prod(rests) * min(rests, default=1.0)) for rests in (left, right))
 
 
 def in_words(pixels: Float64, rig: StereoRig, scale: int = 1, *, right: bool = False) -> list[str]:
