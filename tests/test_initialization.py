@@ -13,7 +13,12 @@ from scipy.stats import spearmanr
 
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import Initialization, InitializationError, initialize
+from suturetrack.initialization import (
+    Initialization,
+    InitializationError,
+    initialize,
+    remaining,
+)
 from suturetrack.initialization.arms import Arms
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.crest import View, find_crest
@@ -440,6 +445,33 @@ def test_a_crossing_that_neither_view_can_tell_is_doubtful() -> None:
     assert is_right or any("an ambiguous crossing" in reason for reason in found.reasons)
 
 
+@pytest.mark.parametrize(
+    ("scenario", "seed", "rig", "why"),
+    [
+        ("clutter", 3126, "endoscope", "a stretch that two strands share"),
+        ("two-threads", 3110, "bench", "an end beside another ridge"),
+    ],
+)
+def test_strands_that_look_like_one_near_by_are_doubtful_in_both_views(
+    scenario: str, seed: int, rig: str, why: str
+) -> None:
+    """They touch at a small angle, and show only some way off that they are two; or one ends there."""
+    scene = open_scene(scenario, seed, rig)
+    field, start = field_and_seed(scene)
+    found = initialize(field, scene.rig, start)
+    is_right = curve_error(dense(found.curve), scene.truth(0)[0].points).rms < 0.3
+    assert is_right or found.confidence < 0.5
+    assert is_right or any(
+        f"{why} in the {view} view" in " ".join(found.reasons) for view in ("left", "right")
+    )
+
+
+def test_the_gravest_doubt_of_the_graver_view_counts_in_full() -> None:
+    assert remaining(((), ())) == 1.0
+    assert remaining((((0.1, 0.4),), ((0.1, 0.9),))) == pytest.approx(0.4)
+    assert remaining((((0.1, 0.64), (0.5, 0.25)), ((0.1, 0.3),))) == pytest.approx(0.25 * 0.8)
+
+
 @pytest.mark.parametrize("seed", [1111, 1818])
 @pytest.mark.parametrize("is_alone", [True, False])
 def test_how_a_thread_passes_itself_is_less_doubtful_where_it_is_alone(
@@ -612,7 +644,7 @@ def test_an_end_is_doubted_beside_what_may_be_thread_only(
     field = painted([(other, (grey, grey, grey)), (own, BLUE)], rig)
     found = initialize(field, rig, Seed(pixel=tuple(own[150])))
     assert any("an end beside another ridge" in why for why in found.reasons) == is_doubtful
-    assert (found.confidence < 0.75) == is_doubtful
+    assert (found.confidence < 0.5) == is_doubtful
 
 
 @pytest.mark.parametrize(
