@@ -60,7 +60,7 @@ def _spans(curve: Nurbs, rig: StereoRig) -> tuple[Float64, Float64]:
     both = views(rig, points, first)
     speed = np.maximum(sum(view.speed for view in both) / 2, 1e-9)
     width = (speed * samples.share).reshape(-1, 3).sum(axis=1)
-    curvature = np.max([_curvature(view, second) for view in both], axis=0)
+    curvature = np.maximum(_curvature(both[0], second), _curvature(both[1], second))
     sharpest = curvature.reshape(-1, 3).max(axis=1)
     wanted = np.clip((384 * _TOLERANCE_PX / np.maximum(sharpest, 1e-6) ** 3) ** 0.25, *_SPACING_PX)
     return width, np.maximum(wanted, width.sum() / _MOST)
@@ -68,15 +68,15 @@ def _spans(curve: Nurbs, rig: StereoRig) -> tuple[Float64, Float64]:
 
 def _curvature(view: View, second: Float64) -> Float64:
     """(k,) of the image curve, 1/px; the depth, which is noisier, has no say in it."""
-    across = (view.normals[:, None, :] @ view.jacobian @ second[:, :, None])[:, 0, 0]
+    across = np.einsum("ki,kij,kj->k", view.normals, view.jacobian, second)
     return np.abs(across) / np.maximum(view.speed, 1e-9) ** 2
 
 
 def _crowded(width: Float64, wanted: Float64) -> list[int]:
     """Interior knots to remove, never two neighbours at once."""
+    merged, needed = width[:-1] + width[1:], np.minimum(wanted[:-1], wanted[1:])
     chosen: list[int] = []
-    for i in range(len(width) - 1):
-        merged, needed = width[i] + width[i + 1], min(wanted[i], wanted[i + 1])
-        if merged < _CROWDED * needed and (not chosen or chosen[-1] < i - 1):
+    for i in np.flatnonzero(merged < _CROWDED * needed).tolist():
+        if not chosen or chosen[-1] < i - 1:
             chosen.append(i)
     return chosen

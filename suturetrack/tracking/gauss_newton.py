@@ -41,6 +41,9 @@ _LEAST_SURPRISE_PX, _SMOOTH = 0.3, 9
 _KEPT, _FAILED_PX = 0.95, 0.6
 # A step that moves no sample further than this is the last: it is a part of what one reading is off.
 _SETTLED_PX = 0.1
+# So is the first one where the thread is as near as this to all of the curve: a second one moves no sample
+# by more than 0.03 px in the median of fields.
+_CALM_PX = 0.35
 # How far from a free end, which nothing bends, it is asked to keep less.
 _FREE_PX = 20.0
 # A first search does not know the thread's direction yet where it has bent.
@@ -133,6 +136,9 @@ def fit(
     for _ in range(rounds):
         linear = _Linearized(samples, control_points, both, images, faded, reach, neighbours)
         surprise = linear.surprise(crowd) if surprise is None else surprise
+        is_calm = linear.farthest_px < _CALM_PX
+        if is_calm:
+            outlier = _OUTLIER_PX
         equations = linear.equations(reference, faded, config, outlier, crowd, surprise)
         equations.add_tips(tips, predicted.control_points - control_points)
         step = equations.solve()
@@ -140,7 +146,7 @@ def fit(
             step = linear.keeping_length(step, equations, known_length)
         control_points = control_points + step
         both = samples.views(images.rig, control_points)
-        if math.isfinite(outlier) and linear.is_near(both):
+        if is_calm or (math.isfinite(outlier) and linear.is_near(both)):
             break
         outlier = max(min(outlier, reach) / 2, _OUTLIER_PX)
         reach = max(reach / 2, _REFINED_PX)
@@ -335,6 +341,11 @@ class _Linearized:
         both = zip(moved, self.views, strict=True)
         steps = (float(np.abs(now.pixels - view.pixels).max()) for now, view in both)
         return max(steps) < _SETTLED_PX
+
+    @property
+    def farthest_px(self) -> float:
+        """How far from the curve the thread was found, at most."""
+        return max(float(np.abs(found.offset).max()) for found in self.offsets)
 
     def surprise(self, crowd: Crowd) -> Float64:
         """(k,) px by which the thread has left the curve where it is alone, and so in between."""

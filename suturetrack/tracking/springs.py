@@ -7,7 +7,7 @@ from scipy.ndimage import binary_dilation, label, median_filter
 
 from suturetrack.camera import StereoRig
 from suturetrack.tracking.reliability import EVENLY
-from suturetrack.tracking.sampling import values_at
+from suturetrack.tracking.sampling import views_at
 from suturetrack.types import Bool, Float64, Nurbs
 
 # Disparity by which a stretch springs aside between two fields, px and against what most of the curve does.
@@ -49,8 +49,8 @@ def sprung_in_depth(before: Nurbs, after: Nurbs, rig: StereoRig, held: Bool) -> 
 
 
 def _disparities(rig: StereoRig, curve: Nurbs) -> Float64:
-    left, right = rig.project(values_at(curve, EVENLY))
-    return left[:, 0] - right[:, 0]
+    left, right = views_at(rig, curve, EVENLY)
+    return left.pixels[:, 0] - right.pixels[:, 0]
 
 
 def _second_differences(values: Float64) -> Float64:
