@@ -200,6 +200,18 @@ def test_the_best_path_is_the_best_of_all(
     assert worth == pytest.approx(reference.best_path(gain, stiffness, reach))
 
 
+@given(st.integers(0, 10_000), st.floats(0.1, 1.0))
+def test_responses_under_shifts_are_those_at_shifted_pixels(seed: int, most: float) -> None:
+    rng = np.random.default_rng(seed)
+    field = rng.normal(0, 0.5, (30, 40, 2)).astype(np.float32)
+    pixels, angle = rng.uniform(-3, 40, (7, 2)), rng.uniform(0, 2 * np.pi, 7)
+    tangents, shifts = np.c_[np.cos(angle), np.sin(angle)], rng.uniform(-9, 9, (5, 2))
+    means = search.shifted_responses(field, pixels, tangents, shifts, most)
+    for mean, shift in zip(means, shifts, strict=True):
+        responses = search.responses(field, pixels + shift, tangents)
+        assert mean == pytest.approx(np.minimum(responses, most).mean())
+
+
 @given(st.floats(-2, 2), st.floats(1.2, 2.5))
 def test_peaks_are_found_below_the_sample(centre: float, sigma: float) -> None:
     grid = 0.5 * np.arange(-10, 11)

@@ -639,21 +639,32 @@ def test_what_runs_beside_a_revoked_curve_takes_its_place(rig: StereoRig, is_acc
     assert not sureness.is_sure
 
 
-@pytest.mark.parametrize("is_shared", [True, False])
-def test_a_seed_that_may_mean_either_thread_makes_none_sure(
-    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, is_shared: bool
+@pytest.mark.parametrize(
+    ("is_shared", "is_alone", "is_sure"),
+    [(True, False, False), (True, True, True), (False, False, True)],
+)
+def test_a_seed_that_may_mean_either_thread_makes_none_sure_unless_there_is_but_one(
+    rig: StereoRig,
+    monkeypatch: pytest.MonkeyPatch,
+    is_shared: bool,
+    is_alone: bool,
+    is_sure: bool,
 ) -> None:
     def look(field: RidgeField, rig: StereoRig, *args: object) -> Initialization:
         found = initialize(field, rig, *args)  # type: ignore[arg-type]
         is_first = field.stamp.frame == 0
-        confidence = 0.3 if is_first else 1.0
-        return replace(found, confidence=confidence, is_seed_shared=is_shared and is_first)
+        return replace(
+            found,
+            confidence=0.3 if is_first else 1.0,
+            is_seed_shared=is_shared and is_first,
+            is_alone=is_alone and not is_first,
+        )
 
     looks_by(monkeypatch, look)
     states = follow(rig, [thread(i / FPS) for i in range(2 * FPS)], range(0))
     assert rms(states[-1], thread(2 - 1 / FPS)) < 0.15
-    assert any("found for sure" in state.events for state in states) != is_shared
-    assert states[-1].status is (Status.OCCLUDED if is_shared else Status.TRACKING)
+    assert any("found for sure" in state.events for state in states) == is_sure
+    assert states[-1].status is (Status.TRACKING if is_sure else Status.OCCLUDED)
 
 
 def test_a_revoked_curve_does_not_tell_the_length(

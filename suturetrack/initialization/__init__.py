@@ -203,11 +203,13 @@ def _reconstruct(start: _Start, field: RidgeField, *, are_moved: bool = False) -
         reason = f"no curve fits both views: {error}"
         raise InitializationError(reason, start.candidates, growth) from None
     shown = rig.with_row_offset(rows)
-    confidence, reasons, doubts = judge(
+    confidence, reasons, doubts, is_alone = judge(
         curve, samples, sigma, found.chains, ridges, shown, start.scale
     )
     distance = samples.distance_px
-    first = Initialization(curve, confidence, reasons, distance, growth, doubts, row_offset_px=rows)
+    first = Initialization(
+        curve, confidence, reasons, distance, growth, doubts, is_alone=is_alone, row_offset_px=rows
+    )
     return first.meaning(either=found.left.meets_another_at(start.pixel))
 
 

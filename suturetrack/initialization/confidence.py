@@ -90,8 +90,8 @@ def judge(
     ridges: tuple[Ridges, Ridges],
     rig: StereoRig,
     scale: int,
-) -> tuple[float, tuple[str, ...], PlacedDoubts]:
-    """Confidence in [0, 1], its reasons, and the doubts that it is lowered by.
+) -> tuple[float, tuple[str, ...], PlacedDoubts, bool]:
+    """Confidence in [0, 1], its reasons, the doubts that it is lowered by, and whether the thread is alone.
 
     Args:
         curve: the result.
@@ -105,7 +105,9 @@ def judge(
     pixels = rig.project(nurbs.evaluate(curve, np.linspace(0, 1, 32 * len(curve.control_points))))
     agreement = min(_agreement(p, c.pixels, rig) for p, c in zip(pixels, chains, strict=True))
     confidence, reasons = _of_the_whole(agreement, samples, sigma, nurbs.length(curve))
-    doubts = _left_in_doubt(pixels, chains, ridges)
+    others = max(_others(line, r) for line, r in zip(pixels, ridges, strict=True))
+    is_alone = others <= _NEXT_TO_NOTHING
+    doubts = _left_in_doubt(pixels, chains, ridges, is_alone=is_alone)
     reasons += _in_words(doubts, rig, scale)
     further = [
         _ends_further_on(p, c.pixels, r) for p, c, r in zip(pixels, chains, ridges, strict=True)
@@ -119,7 +121,7 @@ def judge(
         kept, whys = _of_an_end(end, samples, further)
         confidence *= kept
         reasons += whys
-    return float(confidence), tuple(reasons), (left, right)
+    return float(confidence), tuple(reasons), (left, right), is_alone
 
 
 def _of_the_whole(
@@ -141,12 +143,16 @@ def _of_the_whole(
 
 
 def _left_in_doubt(
-    lines: tuple[Float64, Float64], chains: tuple[Chain, Chain], ridges: tuple[Ridges, Ridges]
+    lines: tuple[Float64, Float64],
+    chains: tuple[Chain, Chain],
+    ridges: tuple[Ridges, Ridges],
+    *,
+    is_alone: bool,
 ) -> list[list[Doubt]]:
     """What each view still doubts once the whole curve is known; `lines` are the curve in both views."""
     doubts = [_settled(_distinct(c), p, r) for c, p, r in zip(chains, lines, ridges, strict=True)]
     doubts = [_confirmed(view, doubts, lines) for view in (0, 1)]
-    if max(_others(line, r) for line, r in zip(lines, ridges, strict=True)) > _NEXT_TO_NOTHING:
+    if not is_alone:
         return doubts
     return [[_of_itself(d, p) for d in of_view] for of_view, p in zip(doubts, lines, strict=True)]
 

@@ -73,6 +73,8 @@ class Initialization:
     """Those of the left and of the right view that the confidence is lowered by."""
     is_seed_shared: bool = False
     """Whether the seed lies on another strand as well, which may be the one that is meant."""
+    is_alone: bool = False
+    """Whether both views show hardly any ridge but the thread's."""
     row_offset_px: float = 0.0
     """How much lower, against the left view, than the calibration says the right view lies; the curve
     is half of it off in each. 0 where that cannot be told from none."""

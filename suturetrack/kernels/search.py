@@ -52,6 +52,19 @@ def responses(field: Float32, pixels: Float64, tangents: Float64) -> Float64:
 
 
 @numba.njit(cache=True, nogil=True)
+def shifted_responses(
+    field: Float32, pixels: Float64, tangents: Float64, shifts: Float64, most: float
+) -> Float64:
+    """(n,) mean response, each of `most` at most, at (k, 2) pixels under each of (n, 2) shifts."""
+    out = np.zeros(len(shifts))
+    for i in range(len(shifts)):
+        for j in range(len(pixels)):
+            u, v = pixels[j, 0] + shifts[i, 0], pixels[j, 1] + shifts[i, 1]
+            out[i] += min(response_at(field, u, v, tangents[j, 0], tangents[j, 1]), most)
+    return out / len(pixels)
+
+
+@numba.njit(cache=True, nogil=True)
 def magnitudes(field: Float32, pixels: Float64) -> Float64:
     """(k,) bilinear |V| at (k, 2) pixels; 0 outside the image."""
     height, width = field.shape[0], field.shape[1]

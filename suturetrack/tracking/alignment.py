@@ -43,7 +43,6 @@ def _shown(both: tuple[View, View], shifts: Float64, images: Images) -> Float64:
     """(n,) how much of the thread the images show under each of n shifts, in [0, 1]."""
     shown = np.zeros(len(shifts))
     for image, view, level in zip(images.both, both, images.levels, strict=True):
-        pixels = (view.pixels + shifts[:, None]).reshape(-1, 2)
-        responses = search.responses(image, pixels, np.tile(view.tangents, (len(shifts), 1)))
-        shown += np.minimum(responses / level, 1.0).reshape(len(shifts), -1).mean(axis=1) / 2
+        means = search.shifted_responses(image, view.pixels, view.tangents, shifts, level)
+        shown += means / level / 2
     return shown

@@ -76,7 +76,7 @@ class Thread:
         self._seeded_at = 0.5
         """Parameter of the curve at which it was found."""
         self._is_seed_shared = False
-        """Whether another thread may be meant: no look can tell."""
+        """Whether another thread may be meant: no look can tell, but one that shows no other."""
         self._fields_to_rest = self._attempts = self._looks_in_vain = 0
         self._clearness = Clearness()
 
@@ -332,6 +332,8 @@ class Thread:
         # The rest may be hidden.
         if self._was_sure and self._sureness.lacks_more(found.curve, search.followed):
             return
+        if found.is_alone and found.confidence >= SURE:
+            self._is_seed_shared = False
         if self._puts_right(found, state):
             self._hold(outcome, "put right", self._sureness)
             return
