@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -151,7 +150,6 @@ def _smooth(profiles: Float64) -> Float64:
     return np.asarray(uniform_filter1d(profiles, _SMOOTHED, mode="nearest"))
 
 
-@lru_cache(maxsize=8)
 def _px_per_s(curve: Nurbs, rig: StereoRig) -> tuple[float, float]:
     """Speed of the curve in the images at its ends, px per unit of s; at least half of that of the rest."""
     left, right = views_at(rig, curve, _ALONG)
