@@ -15,8 +15,7 @@ from suturetrack.types import Bool, Nurbs
 
 # Searches, in units of the first: tried where less than the second is seen, taken if they show more.
 _WIDER = ((2.5, 0.985, 0.01), (6.5, 0.8, 0.05))
-# A jump of all of it is tried where less than this is seen, and taken if it shows so much more.
-_JUMPED, _GAIN = 0.8, 0.02
+_ENOUGH, _GAIN = 0.97, 0.02
 _DROP = 0.01
 # Fields after which what is hidden is looked for further away, too.
 _RETRY = 5
@@ -53,7 +52,7 @@ def fit_widely(
 
     best = fitted(predicted, config.search_px)
     usual = 1.0 if images.field.stamp.frame % _RETRY == 0 else share - _DROP
-    if best.share < min(_JUMPED, usual):
+    if best.share < min(_ENOUGH, usual):
         jumped = fitted(shifted(predicted, images), config.search_px)
         if jumped.share > best.share + _GAIN:
             best = jumped
