@@ -10,8 +10,8 @@ from suturetrack.camera import StereoRig
 from suturetrack.tracking.sampling import Samples, View, views, views_at
 from suturetrack.types import Energies, Float32, Float64, Nurbs, RidgeField
 
-# Pixels of an image that tell the mean of all.
-_SPARSE = 1200
+# About so many pixels of an image tell the mean of all.
+_TELLING = 1200
 
 
 def energies(
@@ -49,7 +49,7 @@ def levels_along(both: tuple[View, View], field: RidgeField) -> tuple[float, flo
 
 def cutoff(image: Float32, level: float) -> float:
     """|V_c| of eq. (7): midway between the mean magnitudes of the thread and of the background."""
-    stride = max(math.isqrt(image.shape[0] * image.shape[1] // _SPARSE), 1)
+    stride = max(math.isqrt(image.shape[0] * image.shape[1] // _TELLING), 1)
     sparse = image[::stride, ::stride]
     return (level + float(np.hypot(sparse[..., 0], sparse[..., 1]).mean())) / 2
 

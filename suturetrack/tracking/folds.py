@@ -41,10 +41,8 @@ def doubled_ends(curve: Nurbs, rig: StereoRig) -> tuple[Tail, Tail]:
     both = samples.views(rig, curve.control_points)
     along = np.cumsum(samples.share * both[0].speed)
     inward = np.arange(0.0, min(_FOLD_PX, along[-1] / 2))
-    start, stop = (
-        _fold(curve, rig, end, np.interp(way, along, samples.s))
-        for end, way in ((0, inward), (1, along[-1] - inward))
-    )
+    start = _fold(curve, rig, 0, np.interp(inward, along, samples.s))
+    stop = _fold(curve, rig, 1, np.interp(along[-1] - inward, along, samples.s))
     tails = _long_tails(samples, both, along)
     return Tail(start, True) if start else tails[0], Tail(stop, True) if stop else tails[1]
 

@@ -472,9 +472,9 @@ class Follower:
         """
         model = self.model
         tips = slice(_TIP), slice(-_TIP, None)
-        shown = find_ends(model.curve, images)
+        ends = find_ends(model.curve, images)
         steps = [
-            self._end_step(end, shown[end], bool(crowded[tip].any()), bool(known[tip].any()))
+            self._end_step(end, ends[end], bool(crowded[tip].any()), bool(known[tip].any()))
             for end, tip in enumerate(tips)
         ]
         start, stop = model.ends.moves(
