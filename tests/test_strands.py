@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from suturetrack.camera import StereoRig
-from suturetrack.initialization import initialize
+from suturetrack.initialization import InitializationConfig, initialize
 from suturetrack.initialization.arms import Arms
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.pricing import Merges
+from suturetrack.initialization.segments import find_ridges
+from suturetrack.initialization.smoothness import ROUGHEST, bend, roughness
 from suturetrack.metrics import curve_error
 from suturetrack.types import Float32, Float64, Nurbs, Seed
 from tests.test_initialization import dense, draw, field_of
@@ -77,6 +79,45 @@ def test_strands_that_cross_go_straight_on() -> None:
     assert crossing_arms.change(touching, straight) == pytest.approx(-change)
     short = Arms(tuple(e[:5] for e in ends), {}, merges, None, None)
     assert short.change(straight, touching) is None
+
+
+def waves(pixels: float) -> Float64:
+    """A line that swings to and fro, once in so many pixels, by 12 px."""
+    run = np.arange(0.0, 400.0, 0.5)
+    return np.c_[120 + run, 240 + 12 * np.sin(2 * np.pi * run / pixels)]
+
+
+def test_strands_are_as_rough_as_they_bend(rig: StereoRig) -> None:
+    views = [field_of(draw(waves(p), rig), draw(waves(p), rig), rig).left for p in (90, 160, 400)]
+    rough, even, smooth = (roughness(find_ridges(v, InitializationConfig())) for v in views)
+    assert rough == ROUGHEST
+    assert smooth < even < rough
+    one, other = waves(400)[200:120:-2], waves(400)[200:280:2]
+    assert abs(bend(one, other, smooth)) < 2
+    # What costs a smooth strand much is little to a rough one.
+    turned = other[0] + (other - other[0]) @ np.array([[0.9, -0.436], [0.436, 0.9]])
+    assert bend(one, turned, smooth) > 2 * bend(one, turned, rough) > 0
+
+
+def test_without_a_long_strand_nothing_tells_how_rough_one_is(rig: StereoRig) -> None:
+    short = draw(waves(140)[:60], rig)
+    assert (
+        roughness(find_ridges(field_of(short, short, rig).left, InitializationConfig())) == ROUGHEST
+    )
+
+
+def test_a_merge_that_leaves_a_piece_out_is_no_rival() -> None:
+    run = np.arange(0.0, 60.0)
+    strand = np.c_[300 + run, np.full(60, 200.0)]
+    before = [np.c_[290 - run, 200 + side * 0.7 * run] for side in (-1, 1)]
+    pieces = strand[:24], strand[25:35], strand[36:]
+    # Two strands may come before its first piece; its last piece would be joined to that about as well.
+    pairs, costs = np.array([[0, 6], [0, 8], [1, 2], [3, 4], [1, 4]]), [0.2, 0.25, 0.1, 0.1, 0.15]
+    merges = Merges(pairs, np.array(costs), *np.zeros((2, 5), bool))
+    arms = Arms([*pieces, *before], {1: 2, 2: 1, 3: 4, 4: 3}, merges, None, None)
+    assert arms.change([(0, 6)], [(0, 8)]) is not None
+    apart = Arms([*pieces, *before], {3: 4, 4: 3}, merges, None, None)
+    assert apart.change([(0, 6)], [(0, 8)]) is None
 
 
 def test_a_faint_ridge_behind_an_end_is_no_thread(rig: StereoRig, curve: Nurbs) -> None:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
 
 from suturetrack.initialization.colours import Tints, difference
 from suturetrack.initialization.depth import Depth, Disparities
 from suturetrack.initialization.joints import Pair, inward
 from suturetrack.initialization.pricing import Merges
-from suturetrack.polylines import arc_lengths
+from suturetrack.initialization.smoothness import ROUGHEST, bend, step
 from suturetrack.types import Float64
 
 REACH = 60
@@ -31,13 +31,7 @@ _MOST_BENT, _MOST_RECOLOURED = 25.0, 8.0
 _LEAST_HIDDEN_ARM = 20
 _HIDDEN_PX = 30.0
 """Length of a hidden stretch that is worth a unit of energy."""
-_DISPARITY_BEND = 1e-4
-_SHAPE_BEND = 3e-5
-"""Spectral density of the change of slope in disparity, and of curvature in an image, 1/px."""
-_SHAPE_NOISE_PX = 0.25
 _SKIPPED, _SHAPE_POINTS, _EVERY = 4, 40, 2
-_ANYWHERE_PX = 100.0
-_ANY_CURVATURE = 0.05
 
 
 class Arms:
@@ -50,10 +44,11 @@ class Arms:
         merges: Merges | None,
         depth: Depth | None,
         tints: Tints | None,
+        roughness: float = ROUGHEST,
     ) -> None:
         self._segments, self._partner, self._depth = segments, partner, depth
-        self._tints = tints
-        self._leads = {} if merges is None else _leads(merges)
+        self._tints, self._roughness = tints, roughness
+        self._leads = {} if merges is None else _leads(merges, partner)
         self._arms: dict[int, Float64] = {}
         self._disparities: dict[int, Disparities | None] = {}
         self._colours: dict[int, Float64] = {}
@@ -61,7 +56,7 @@ class Arms:
     @cached_property
     def pieces(self) -> Arms:
         """The arms as far as the segments go by themselves, whoever may share them."""
-        return Arms(self._segments, {}, None, self._depth, self._tints)
+        return Arms(self._segments, {}, None, self._depth, self._tints, self._roughness)
 
     def with_steps(self, merges: Merges) -> Merges:
         """The merges, those dearer whose arms differ in depth or in colour."""
@@ -83,7 +78,7 @@ class Arms:
         """Energy of the bend between the arms of two ends; 0 where one is too short to tell."""
         if i // 2 == j // 2 or min(len(self._arm(i)), len(self._arm(j))) < _LEAST_ARM:
             return 0.0
-        return _bend(self._arm(i), self._arm(j))
+        return self._bend(i, j)
 
     def goes_on(self, i: int, j: int) -> float:
         """Energy by which the arms of two ends are less well one strand, hidden between them, than two:
@@ -92,11 +87,19 @@ class Arms:
         if i // 2 == j // 2 or min(len(one), len(other)) < _LEAST_HIDDEN_ARM:
             return np.inf
         length = float(np.linalg.norm(other[0] - one[0]))
-        return _bend(one, other) + self._step(i, j) + (length / _HIDDEN_PX) ** 2
+        return self._bend(i, j) + self._step(i, j) + (length / _HIDDEN_PX) ** 2
 
     def _misfit(self, i: int, j: int) -> float:
-        bend = _bend(self._arm(i), self._arm(j))
+        bend = self._bend(i, j)
         return ENERGY * (bend + self._step(i, j) + self._change_of_colour(i, j))
+
+    def _bend(self, i: int, j: int) -> float:
+        """How much more the arms of two ends have to bend as one strand than as two."""
+        one, other = (
+            arm[min(_SKIPPED, len(arm) // 4) : _SHAPE_POINTS : _EVERY]
+            for arm in (self._arm(i), self._arm(j))
+        )
+        return bend(one, other, self._roughness)
 
     def _step(self, i: int, j: int) -> float:
         """Energy of a step in depth from one arm to the other."""
@@ -106,7 +109,7 @@ class Arms:
             if end not in self._disparities:
                 self._disparities[end] = self._depth.along(self._arm(end))
         one, other = self._disparities[i], self._disparities[j]
-        return 0.0 if one is None or other is None else min(_step(one, other), _MOST_BENT)
+        return 0.0 if one is None or other is None else min(step(one, other), _MOST_BENT)
 
     def _change_of_colour(self, i: int, j: int) -> float:
         """Energy of a step in colour from one arm to the other."""
@@ -146,71 +149,25 @@ class Arms:
         return np.concatenate(points)[:REACH]
 
 
-def _leads(merges: Merges) -> dict[int, float]:
-    """How much dearer the second best merge of an end is than its best."""
-    costs: dict[int, list[float]] = {}
-    for pair, cost in zip(merges.pairs.tolist(), merges.cost.tolist(), strict=True):
-        if cost < _LIKELY:
+def _leads(merges: Merges, partner: dict[int, int]) -> dict[int, float]:
+    """How much dearer the second best merge of an end is than its best; one that leaves out a segment of the
+    same strand, which no other strand might take, is no other."""
+    likely = merges.cost < _LIKELY
+    pairs, costs = merges.pairs[likely].tolist(), merges.cost[likely].tolist()
+    between = [_between(i, j, partner) for i, j in pairs]
+    rivals = Counter(
+        e for pair, left_out in zip(pairs, between, strict=True) if not left_out for e in pair
+    )
+    found: dict[int, list[float]] = {}
+    for pair, left_out, cost in zip(pairs, between, costs, strict=True):
+        if not left_out or any(rivals[end] > 1 for end in left_out):
             for end in pair:
-                costs.setdefault(end, []).append(cost)
-    return {e: sorted(c)[1] - min(c) for e, c in costs.items() if len(c) > 1}
+                found.setdefault(end, []).append(cost)
+    return {e: sorted(c)[1] - min(c) for e, c in found.items() if len(c) > 1}
 
 
-def _bend(one: Float64, other: Float64) -> float:
-    """How much more two arms (k, 2) and (m, 2) have to bend as one strand than as two."""
-    one, other = (
-        a[min(_SKIPPED, len(a) // 4) : _SHAPE_POINTS : _EVERY] for a in (one[:REACH], other[:REACH])
-    )
-    t = arc_lengths(np.r_[one[::-1], other])
-    variances = [np.full(len(a), _SHAPE_NOISE_PX**2) for a in (one[::-1], other)]
-    return _excess(t, (one[::-1], other), variances, _curving)
-
-
-def _step(one: Disparities, other: Disparities) -> float:
-    """How much more the disparity of two arms has to change as one strand than as two."""
-    t = arc_lengths(np.r_[one.pixels[::-1], other.pixels])
-    values = one.value[::-1, None], other.value[:, None]
-    variances = [one.variance[::-1], other.variance]
-    return max(_excess(t, values, variances, _sloping), 0.0)
-
-
-def _excess(
-    t: Float64,
-    values: tuple[Float64, Float64],
-    variances: list[Float64],
-    prior: Callable[[Float64], Float64],
-) -> float:
-    """Energy of (k, d) and (m, d) values at the places t as one strand, less that as two."""
-    n = len(values[0])
-    one = _energy(t, np.concatenate(values), np.concatenate(variances), prior)
-    return (
-        one
-        - _energy(t[:n], values[0], variances[0], prior)
-        - _energy(t[n:], values[1], variances[1], prior)
-    )
-
-
-def _energy(
-    t: Float64, values: Float64, variance: Float64, prior: Callable[[Float64], Float64]
-) -> float:
-    """Minus the exponent of the Gaussian process `prior` at noisy values (k, d)."""
-    covariance = prior(t - t[0])
-    covariance[np.diag_indices(len(t))] += variance
-    values = values - values.mean(0)
-    factor = cholesky(covariance, lower=True)
-    return 0.5 * float((values * cho_solve((factor, True), values)).sum())
-
-
-def _sloping(t: Float64) -> Float64:
-    """(k, k) covariance of a line whose slope drifts."""
-    least, gap, centred = np.minimum.outer(t, t), abs(np.subtract.outer(t, t)), t - t.mean()
-    drift = least**3 / 3 + gap * least**2 / 2
-    return _DISPARITY_BEND * drift + _ANYWHERE_PX**2 + np.outer(centred, centred)
-
-
-def _curving(t: Float64) -> Float64:
-    """(k, k) covariance of a curve whose curvature drifts."""
-    least, gap, centred = np.minimum.outer(t, t), abs(np.subtract.outer(t, t)), t - t.mean()
-    drift = least**5 / 20 + gap * least**4 / 8 + gap**2 * least**3 / 12
-    bent = _ANY_CURVATURE**2 * np.outer(centred**2, centred**2)
-    return _SHAPE_BEND * drift + _ANYWHERE_PX**2 + np.outer(centred, centred) + bent
+def _between(i: int, j: int, partner: dict[int, int]) -> list[int]:
+    """The ends of the one segment that joins two ends; none if none does."""
+    if i not in partner or partner.get(partner[i] ^ 1) != j:
+        return []
+    return [partner[i], partner[i] ^ 1]

@@ -14,6 +14,7 @@ from suturetrack.initialization.hairpins import double_stubs
 from suturetrack.initialization.joints import Joints, Pair, inward
 from suturetrack.initialization.pricing import DEAR_END, FEW_ENDS, FREE_END, Merges, price_merges
 from suturetrack.initialization.segments import ARM, Ridges
+from suturetrack.initialization.smoothness import roughness
 from suturetrack.polylines import unit
 
 _LONGEST_RUN = 4
@@ -41,7 +42,7 @@ def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None
         return Joints([], {})
     merges = price_merges(ridges, config)
     first = _merge(ridges, merges, None)
-    arms = Arms(first.segments, first.partner, merges, depth, ridges.tints)
+    arms = Arms(first.segments, first.partner, merges, depth, ridges.tints, roughness(ridges))
     merges = arms.with_steps(merges)
     joints = _merge(ridges, merges, arms)
     if 2 < len(joints.free) <= FEW_ENDS:
