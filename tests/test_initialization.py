@@ -545,24 +545,6 @@ def test_a_seed_between_two_veins_that_end_on_the_thread_means_the_thread(
     assert found.is_seed_shared == is_shared
 
 
-def test_what_is_hardly_seen_says_little_about_depth(rig: StereoRig) -> None:
-    """Where something covers the thread, its rim is a faint ridge on other sides in the two views."""
-    t = np.linspace(0, 1, 800)
-    thread = np.c_[200 + 260 * t, 240 + 70 * np.sin(5 * t)]
-    covered = slice(340, 460)
-    views = []
-    for shift, aside in ((0, 1.2), (110, -1.2)):
-        own = thread - [shift, 0]
-        view = draw(own[covered] + [aside, 0], rig, grey=174)
-        for part in (own[: covered.start], own[covered.stop :]):
-            view = draw(part, rig, view)
-        views.append(view)
-    seed = Seed(pixel=(float(thread[200, 0]), float(thread[200, 1])))
-    found = initialize(field_of(views[0], views[1], rig), rig, seed)
-    left, right = rig.project(dense(found.curve))
-    assert np.abs(left[:, 0] - right[:, 0] - 110)[50:-50].max() < 0.3
-
-
 @pytest.mark.parametrize("is_joined", [True, False])
 def test_a_thread_that_may_have_run_into_another_one_is_doubtful(
     rig: StereoRig, is_joined: bool

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -23,9 +22,6 @@ _ASIDE_PX = 5.0
 """Distance up to which another strand draws a crest aside."""
 _DRAWN = 0.1
 """How much such a crest counts."""
-_FAINT, _FADING = 0.35, 4
-"""Response, against the usual one, from which a crest is as sure as any, and the power of it by which fainter
-ones count less: they may be the rim of what hides the thread."""
 _ITSELF_PX = 11.0
 """Length of a curve between two places that near, from which it comes back beside itself there."""
 
@@ -61,13 +57,10 @@ class Crest:
     """(k,) in [0, 1]; low where the ridge is wider than elsewhere, or near that of another strand, or where
     the curve comes back beside itself, which draws the crest aside."""
 
-    @cached_property
+    @property
     def trust(self) -> Float64:
-        """(k,) weights of the offsets: crests far off, or faint, are more often another's."""
-        seen = self.response[self.response > 0]
-        usual = float(np.median(seen)) if len(seen) else 1.0
-        sure = np.minimum(self.response / (_FAINT * usual), 1.0) ** _FADING
-        return sure * self.clear * self.response / (1 + self.offsets**2)
+        """(k,) weights of the offsets: crests far off are more often another's."""
+        return self.clear * self.response / (1 + self.offsets**2)
 
 
 def find_crest(view: View, pixels: Float64) -> Crest:
