@@ -90,8 +90,8 @@ class Arms:
         return self._bend(i, j) + self._step(i, j) + (length / _HIDDEN_PX) ** 2
 
     def _misfit(self, i: int, j: int) -> float:
-        bend = self._bend(i, j)
-        return ENERGY * (bend + self._step(i, j) + self._change_of_colour(i, j))
+        energy = self._bend(i, j) + self._step(i, j) + self._change_of_colour(i, j)
+        return ENERGY * energy
 
     def _bend(self, i: int, j: int) -> float:
         """How much more the arms of two ends have to bend as one strand than as two."""
