@@ -354,7 +354,8 @@ def test_crests_count_less_where_a_thread_comes_back_beside_itself(rig: StereoRi
     there, back = np.arange(100.0, 300, 2), np.arange(300.0, 200, -2)
     pixels = np.r_[np.c_[there, 0 * there + 300], np.c_[back, 0 * back + 304.5]]
     image = draw(pixels, rig)
-    crest = find_crest(View(field_of(image, image, rig).left, np.empty((0, 2))), pixels)
+    view = View(field_of(image, image, rig).left, *np.empty((3, 0, 2)))
+    crest = find_crest(view, pixels)
     assert crest.clear[:45].min() > 0.7
     assert crest.clear[55:90].max() < 0.2
     assert crest.clear[110:145].max() < 0.2

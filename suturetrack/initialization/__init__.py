@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from suturetrack.camera import StereoRig
+from suturetrack.initialization.abreast import tell_apart
 from suturetrack.initialization.confidence import judge
 from suturetrack.initialization.config import InitializationConfig
-from suturetrack.initialization.crest import View
 from suturetrack.initialization.ends import move_end, read_end
 from suturetrack.initialization.fitting import refine
 from suturetrack.initialization.growth import grow_thread
@@ -190,12 +190,8 @@ def _reconstruct(start: _Start, field: RidgeField, *, are_moved: bool = False) -
         other = match(found.left.chain.pixels, field.left, field.right, infinity, -1)
         swapped = _is_matched(other)
         raise InitializationError(_no_match(swapped), start.candidates, growth, swapped=swapped)
-    views = (
-        View(found.left.field, found.left.others),
-        View(field.right, np.empty((0, 2)))
-        if found.right is None
-        else View(found.right.field, found.right.others),
-    )
+    fields = found.left.field, field.right if found.right is None else found.right.field
+    views = tell_apart(fields, found.pixels, found.others)
     try:
         curve = _first_curve(_trim(found.pixels, found.left), rig, config)
         curve, samples, sigma, rows = refine(curve, views, rig, are_moved=are_moved)

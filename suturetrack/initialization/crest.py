@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from suturetrack.kernels import search
 from suturetrack.kernels.widths import moments, single
 from suturetrack.polylines import arc_lengths, polyline_tangents
-from suturetrack.types import Float32, Float64
+from suturetrack.types import Bool, Float32, Float64
 
 _OFFSETS = np.arange(-4.0, 4.01, 0.5)
 """Where the crest is looked for across the curve, px."""
@@ -22,6 +22,8 @@ _ASIDE_PX = 5.0
 """Distance up to which another strand draws a crest aside."""
 _DRAWN = 0.1
 """How much such a crest counts."""
+_BLURRED_PX, _BESIDE_PX, _FARTHEST_PX = 2.5, 1.6, 8.0
+"""How far a curve may be from a pixel that is blurred, and along and across itself from one that is told."""
 _ITSELF_PX = 11.0
 """Length of a curve between two places that near, from which it comes back beside itself there."""
 
@@ -34,13 +36,28 @@ class View:
     """(H, W, 2)."""
     others: Float64
     """(k, 2) pixels on the ridges of other strands, about 1 px apart."""
+    told: Float64
+    """(k, 2) pixels of the thread beside other strands, as the flanks of the ridges tell them."""
+    blurred: Float64
+    """(k, 2) pixels near which the ridge may be that of several strands, and nothing tells them apart."""
 
     def clear(self, pixels: Float64) -> Float64:
         """(k,) in [0, 1]: low where another strand draws the crest at (k, 2) pixels aside."""
-        if not len(self.others):
-            return np.ones(len(pixels))
-        distance, _ = cKDTree(self.others).query(pixels, distance_upper_bound=_ASIDE_PX)
-        return np.where(np.isfinite(distance), _DRAWN, 1.0)
+        aside = _is_near(pixels, self.others, _ASIDE_PX) | _is_near(
+            pixels, self.blurred, _BLURRED_PX
+        )
+        return np.where(aside, _DRAWN, 1.0)
+
+    def told_beside(self, pixels: Float64, normals: Float64) -> Float64:
+        """(k,) signed distance from (k, 2) pixels to where the thread is told along (k, 2) normals, px; NaN
+        where it is not."""
+        if not len(self.told):
+            return np.full(len(pixels), np.nan)
+        _, nearest = cKDTree(self.told).query(pixels)
+        there = self.told[nearest] - pixels
+        across = (there * normals).sum(1)
+        along = np.linalg.norm(there - across[:, None] * normals, axis=1)
+        return np.where((along < _BESIDE_PX) & (np.abs(across) < _FARTHEST_PX), across, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +95,20 @@ def find_crest(view: View, pixels: Float64) -> Crest:
     heights = np.take_along_axis(profiles, peak[:, None], 1)[:, 0]
     normals = np.c_[-tangents[:, 1], tangents[:, 0]]
     clear = single(spread, usual) * np.minimum(view.clear(pixels), _clear_of_itself(pixels))
+    told = view.told_beside(pixels, normals)
+    is_told = np.isfinite(told)
+    if is_told.any() and seen.any():
+        offsets, clear = np.where(is_told, told, offsets), np.where(is_told, _DRAWN, clear)
+        heights = np.where(is_told, np.median(heights[seen]), heights)
+        seen |= is_told
     return Crest(normals, np.where(seen, offsets, 0.0), np.where(seen, heights, 0.0), clear)
+
+
+def _is_near(pixels: Float64, places: Float64, reach: float) -> Bool:
+    """(k,) whether (k, 2) pixels are within reach of some of (m, 2) places."""
+    if not len(places):
+        return np.zeros(len(pixels), bool)
+    return np.isfinite(cKDTree(places).query(pixels, distance_upper_bound=reach)[0])
 
 
 def _clear_of_itself(pixels: Float64) -> Float64:

@@ -49,6 +49,13 @@ class Hypothesis:
         nothing = Chain(np.empty((0, 2)))
         return self.left.chain, nothing if self.right is None else self.right.chain
 
+    @property
+    def others(self) -> tuple[list[Float64], list[Float64]]:
+        """The ridges of other strands in both views, (m, 2) pixels each."""
+        pixels = self.pixels
+        right = [] if self.right is None else self.right.others_along(pixels[:, 2:])
+        return self.left.others_along(pixels[:, :2]), right
+
 
 def find_thread(
     field: RidgeField,

@@ -53,6 +53,8 @@ _LEAVES_PX, _AROUND_PX = 6.0, 60.0
 for longer is a part of it that was doubled."""
 _BESIDE_PX = 5
 """How far beside its crest a ridge shows."""
+_ANOTHER_WAY_PX, _OWN_PX = 3.0, 1.5
+"""How far from a path a chain goes that runs another way, and how near the path's own segments are."""
 _WINDOW, _STEP_POINTS = 10, 3
 """Points whose strength counts on each side of an end, and those about it that do not."""
 
@@ -104,11 +106,22 @@ class Thread:
         """The segments in order, each run in the direction of the thread."""
         return [inward(self.ridges.segments, entry) for entry in self.entries]
 
-    @property
-    def others(self) -> Float64:
-        """(k, 2) pixels on the ridges of other strands, as clear as the thread's or shared with it."""
+    def others_along(self, path: Float64) -> list[Float64]:
+        """The ridges of other strands, as clear as the thread's or shared with it, (m, 2) pixels each.
+
+        Args:
+            path: (k, 2) pixels of the thread; where the chain runs another way they are right.
+        """
         segments = self.ridges.segments
-        return np.concatenate([np.empty((0, 2)), *(segments[k] for k in self._others(_FAINT))])
+        if polyline_distances(path, self.chain.pixels).max() < _ANOTHER_WAY_PX:
+            return [segments[k] for k in self._others(_FAINT)]
+        level, near = _FAINT * self._strength, cKDTree(path)
+        return [
+            segment
+            for segment in segments
+            if np.median(self.ridges.sample(segment)) > level
+            and np.median(near.query(segment)[0]) > _OWN_PX
+        ]
 
     def meets_another_at(self, place: Float64) -> bool:
         """Whether another strand that leads away runs as near by a pixel (2,) as the thread itself."""
