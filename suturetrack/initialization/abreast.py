@@ -170,12 +170,14 @@ def _strands_beside(
     if not others:
         return beside, shared
     points = np.concatenate(others)
-    away, _ = cKDTree(pixels).query(points)
+    away = np.asarray(cKDTree(pixels).query(points)[0])
     starts = np.cumsum([0, *(len(piece) for piece in others[:-1])])
     leads_away = np.repeat(
         np.maximum.reduceat(away, starts) >= _LEAVES_PX, [len(p) for p in others]
     )
-    distance, nearest = cKDTree(points).query(pixels, distance_upper_bound=_NEAR_PX)
+    distance, nearest = map(
+        np.asarray, cKDTree(points).query(pixels, distance_upper_bound=_NEAR_PX)
+    )
     near = np.flatnonzero(np.isfinite(distance))
     nearest = nearest[near]
     across = ((points[nearest] - pixels[near]) * normals[near]).sum(1)
