@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from suturetrack.initialization.crest import View
+from suturetrack.initialization.crest import View, is_near
 from suturetrack.initialization.smoothness import depth_energy, shape_energy
 from suturetrack.kernels import search
 from suturetrack.polylines import arc_lengths, polyline_tangents
@@ -24,8 +24,9 @@ _NEAR_PX = 6.0
 """Distance up to which another strand lies beside the path."""
 _ASIDE_PX, _ASIDE = 2.0, 0.6
 """How far aside it lies at least, and which share of its distance, for its side to be known."""
-_LEAVES_PX = 8.0
-"""Distance from the path that a strand reaches which leads away from it."""
+_LEAVES_PX, _ON_PX = 8.0, 1.5
+"""Distance from the path that a strand reaches which leads away from it, and from that up to which a ridge is
+its own."""
 _TOGETHER_PX = 100.0
 """Length up to which two strands may run as one ridge between places where they are apart."""
 _AS_CLEAR = 0.35
@@ -145,12 +146,16 @@ def _look(field: Float32, path: Float64, others: Sequence[Float64]) -> _Flanks:
     pixels = gaussian_filter1d(path, 1.0, axis=0, mode="nearest")
     tangents = polyline_tangents(pixels)
     normals = np.c_[-tangents[:, 1], tangents[:, 0]]
-    beside, shared = _strands_beside(pixels, normals, others)
+    leading = _leading_away(pixels, others)
+    beside, shared = _strands_beside(pixels, normals, others, leading)
     alone = ~shared & (beside == 0)
     if alone.all():
         return _Flanks.of_one_strand(pixels, normals)
     profiles = search.normal_profiles(field, pixels, tangents, _ACROSS, 0.0)
-    edges = [_edges(*p) for p in zip(profiles, shared.tolist(), strict=True)]
+    tops = _tops(profiles)
+    there = pixels[shared, None] + _ACROSS[:, None] * normals[shared, None]
+    tops[shared] &= ~is_near(there.reshape(-1, 2), leading, _ON_PX).reshape(-1, len(_ACROSS))
+    edges = [_edges(*p) for p in zip(profiles, tops, shared.tolist(), strict=True)]
     left, right = np.array(edges, np.float64).T
     width: Float64 = (right - left)[alone]
     if np.isfinite(width).sum() < _LEAST_ALONE:
@@ -162,27 +167,25 @@ def _look(field: Float32, path: Float64, others: Sequence[Float64]) -> _Flanks:
     return _Flanks(pixels, normals, np.array([left + aside, right - aside]), wider, beside, shared)
 
 
+def _leading_away(pixels: Float64, others: Sequence[Float64]) -> Float64:
+    """(m, 2) pixels on the ridges of strands that lead away from the path (k, 2)."""
+    path = cKDTree(pixels)
+    return np.concatenate(
+        [_NOWHERE, *(piece for piece in others if np.max(path.query(piece)[0]) >= _LEAVES_PX)]
+    )
+
+
 def _strands_beside(
-    pixels: Float64, normals: Float64, others: Sequence[Float64]
+    pixels: Float64, normals: Float64, others: Sequence[Float64], leading: Float64
 ) -> tuple[Int64, Bool]:
     """(k,) `beside` and `shared` of `_Flanks`."""
     beside, shared = np.zeros(len(pixels), np.int64), np.zeros(len(pixels), bool)
-    if not others:
-        return beside, shared
-    points = np.concatenate(others)
-    away = np.asarray(cKDTree(pixels).query(points)[0])
-    starts = np.cumsum([0, *(len(piece) for piece in others[:-1])])
-    leads_away = np.repeat(
-        np.maximum.reduceat(away, starts) >= _LEAVES_PX, [len(p) for p in others]
-    )
-    distance, nearest = map(
-        np.asarray, cKDTree(points).query(pixels, distance_upper_bound=_NEAR_PX)
-    )
-    near = np.flatnonzero(np.isfinite(distance))
-    nearest = nearest[near]
-    across = ((points[nearest] - pixels[near]) * normals[near]).sum(1)
-    is_aside = np.abs(across) > np.maximum(_ASIDE * distance[near], _ASIDE_PX)
-    beside[near] = np.where(is_aside & leads_away[nearest], np.sign(across), 0)
+    if len(leading):
+        distance, nearest = map(np.asarray, cKDTree(leading).query(pixels))
+        across = ((leading[nearest] - pixels) * normals).sum(1)
+        is_aside = np.abs(across) > np.maximum(_ASIDE * distance, _ASIDE_PX)
+        beside = np.where(is_aside & (distance < _NEAR_PX), np.sign(across), 0).astype(np.int64)
+    near = np.flatnonzero(is_near(pixels, np.concatenate([_NOWHERE, *others]), _NEAR_PX))
     shared[near] = beside[near] == 0
     travelled = arc_lengths(pixels)[near]
     for k in np.flatnonzero(np.diff(travelled) <= _TOGETHER_PX):
@@ -190,16 +193,17 @@ def _strands_beside(
     return beside, shared
 
 
-def _edges(profile: Float64, is_shared: bool) -> tuple[float, float]:
+def _tops(profiles: Float64) -> Bool:
+    """(k, m) where (k, m) profiles have a ridge."""
+    inner, found = profiles[:, 1:-1], np.zeros(profiles.shape, bool)
+    found[:, 1:-1] = (inner >= profiles[:, :-2]) & (inner >= profiles[:, 2:]) & (inner > 0)
+    return found & (np.abs(_ACROSS) <= _NEAR_PX)
+
+
+def _edges(profile: Float64, is_top: Bool, is_shared: bool) -> tuple[float, float]:
     """Where the left and the right flank of the ridge by the path are, or where that `is_shared` those of the
     outermost ridges, px; NaN where there are none."""
-    inner = profile[1:-1]
-    tops = 1 + np.flatnonzero(
-        (inner >= profile[:-2])
-        & (inner >= profile[2:])
-        & (inner > 0)
-        & (np.abs(_ACROSS[1:-1]) <= _NEAR_PX)
-    )
+    tops = np.flatnonzero(is_top)
     if not len(tops):
         return np.nan, np.nan
     if is_shared:
@@ -210,11 +214,11 @@ def _edges(profile: Float64, is_shared: bool) -> tuple[float, float]:
 
 
 def _edge(profile: Float64, top: int, way: int) -> float:
-    """Where a ridge has fallen to the height of a flank, px."""
+    """Where a ridge has fallen to the height of a flank, px; NaN where it rises again before."""
     level = _FLANK * profile[top]
     falling = profile[top:] if way > 0 else profile[top::-1]
     below = np.flatnonzero(falling <= level)
-    if not len(below):
+    if not len(below) or (np.diff(falling[: below[0] + 1]) > 0).any():
         return np.nan
     k = int(below[0])
     share = (falling[k - 1] - level) / (falling[k - 1] - falling[k])

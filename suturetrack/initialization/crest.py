@@ -43,9 +43,7 @@ class View:
 
     def clear(self, pixels: Float64) -> Float64:
         """(k,) in [0, 1]: low where another strand draws the crest at (k, 2) pixels aside."""
-        aside = _is_near(pixels, self.others, _ASIDE_PX) | _is_near(
-            pixels, self.blurred, _BLURRED_PX
-        )
+        aside = is_near(pixels, self.others, _ASIDE_PX) | is_near(pixels, self.blurred, _BLURRED_PX)
         return np.where(aside, _DRAWN, 1.0)
 
     def told_beside(self, pixels: Float64, normals: Float64) -> Float64:
@@ -104,7 +102,7 @@ def find_crest(view: View, pixels: Float64) -> Crest:
     return Crest(normals, np.where(seen, offsets, 0.0), np.where(seen, heights, 0.0), clear)
 
 
-def _is_near(pixels: Float64, places: Float64, reach: float) -> Bool:
+def is_near(pixels: Float64, places: Float64, reach: float) -> Bool:
     """(k,) whether (k, 2) pixels are within reach of some of (m, 2) places."""
     if not len(places):
         return np.zeros(len(pixels), bool)
