@@ -24,11 +24,13 @@ _NEAR_PX = 6.0
 """Distance up to which another strand lies beside the path."""
 _ASIDE_PX, _ASIDE = 2.0, 0.6
 """How far aside it lies at least, and which share of its distance, for its side to be known."""
-_LEAVES_PX, _ON_PX = 8.0, 1.5
+_LEAVES_PX, _ON_PX = 8.0, 1.0
 """Distance from the path that a strand reaches which leads away from it, and from that up to which a ridge is
 its own."""
 _TOGETHER_PX = 100.0
 """Length up to which two strands may run as one ridge between places where they are apart."""
+_EXPECTED_PX = 2.0
+"""How far from the path the thread's ridge is expected where it is alone (standard deviation)."""
 _AS_CLEAR = 0.35
 """Height of a ridge, against the highest one beside the path, from which it may be the thread's."""
 _FLANK = 0.3
@@ -44,6 +46,8 @@ _APART_NOISE_PX, _DRAWN_NOISE_PX, _ALONE_NOISE_PX = 0.35, 0.6, 0.25
 _CONTEXT, _NEXT, _MOST_RUNS = 15, 8, 6
 """Samples around stretches by which these are judged, between two that are judged together, and how many
 are at most."""
+_LEAST_WIDE = 2
+"""Samples of such a stretch at least."""
 _LEAST_KNOWN = 6
 """Samples that say anything of a bend, or of depth, at least."""
 _NOWHERE: Float64 = np.empty((0, 2))
@@ -127,19 +131,13 @@ class _Flanks:
         is_known = np.isfinite(self.noise(side))
         return self.pixels[(self.shared | (self.beside != 0)) & ~is_known]
 
-    def sides(self) -> tuple[Int64, list[tuple[int, int]]]:
-        """(k,) known sides of the thread, 0 elsewhere, and the stretches whose side is not known."""
-        side, unknown = -self.beside, []
-        wide = self.shared & (self.wider > _TWO_PX)
-        for start, stop in _runs(wide):
-            if stop - start < 2:
-                continue
-            next_to = {*side[max(start - 1, 0) : start], *side[stop : stop + 1]} - {0}
-            if len(next_to) == 1:
-                side[start:stop] = next_to.pop()
-            else:
-                unknown.append((start, stop))
-        return side, unknown
+    def unknown(self) -> list[tuple[int, int]]:
+        """The stretches in which the thread runs on either side of another strand."""
+        wide = np.flatnonzero(
+            np.diff(self.shared & (self.wider > _TWO_PX), prepend=False, append=False)
+        )
+        runs = wide.reshape(-1, 2).tolist()
+        return [(start, stop) for start, stop in runs if stop - start >= _LEAST_WIDE]
 
 
 def _look(field: Float32, path: Float64, others: Sequence[Float64]) -> _Flanks:
@@ -195,9 +193,9 @@ def _strands_beside(
 
 def _tops(profiles: Float64) -> Bool:
     """(k, m) where (k, m) profiles have a ridge."""
-    inner, found = profiles[:, 1:-1], np.zeros(profiles.shape, bool)
-    found[:, 1:-1] = (inner >= profiles[:, :-2]) & (inner >= profiles[:, 2:]) & (inner > 0)
-    return found & (np.abs(_ACROSS) <= _NEAR_PX)
+    inner, tops = profiles[:, 1:-1], np.zeros(profiles.shape, bool)
+    tops[:, 1:-1] = (inner >= profiles[:, :-2]) & (inner >= profiles[:, 2:]) & (inner > 0)
+    return tops & (np.abs(_ACROSS) <= _NEAR_PX)
 
 
 def _edges(profile: Float64, is_top: Bool, is_shared: bool) -> tuple[float, float]:
@@ -209,7 +207,7 @@ def _edges(profile: Float64, is_top: Bool, is_shared: bool) -> tuple[float, floa
     if is_shared:
         high = tops[profile[tops] > _AS_CLEAR * profile[tops].max()]
         return _edge(profile, high[0], -1), _edge(profile, high[-1], 1)
-    top = tops[np.argmax(profile[tops] * np.exp(-0.5 * (_ACROSS[tops] / 2) ** 2))]
+    top = tops[np.argmax(profile[tops] * np.exp(-0.5 * (_ACROSS[tops] / _EXPECTED_PX) ** 2))]
     return _edge(profile, top, -1), _edge(profile, top, 1)
 
 
@@ -226,10 +224,10 @@ def _edge(profile: Float64, top: int, way: int) -> float:
 
 
 def _choose(both: list[_Flanks]) -> list[Int64]:
-    """(k,) side of the thread in each view."""
-    found = [flanks.sides() for flanks in both]
-    sides = [side for side, _ in found]
-    runs = sorted((*run, view) for view, (_, unknown) in enumerate(found) for run in unknown)
+    """(k,) on which side of another strand the thread runs in each view; 0 where there is none, or nothing
+    tells."""
+    sides = [-flanks.beside for flanks in both]
+    runs = sorted((*run, view) for view, flanks in enumerate(both) for run in flanks.unknown())
     for group in _groups(runs):
         first, last = group[0][0], max(stop for _, stop, _ in group)
         window = slice(max(first - _CONTEXT, 0), last + _CONTEXT)
@@ -285,8 +283,3 @@ def _energy(both: list[_Flanks], sides: list[Int64], window: slice) -> float:
         return energy
     travelled = arc_lengths(both[0].pixels[window])
     return energy + depth_energy(travelled[told], disparity[told], variance[told])
-
-
-def _runs(mask: Bool) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False)).tolist()
-    return list(zip(edges[::2], edges[1::2], strict=True))
