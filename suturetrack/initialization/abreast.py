@@ -106,6 +106,12 @@ class _Flanks:
             pixels, normals, np.zeros((2, k)), np.zeros(k), np.zeros(k, np.int64), np.zeros(k, bool)
         )
 
+    @property
+    def tells_depth(self) -> Bool:
+        """(k,) where the path does not run along the rows: there a little aside in one view is far off in
+        depth, while another strand draws the crests of both views alike."""
+        return np.abs(self.normals[:, 0]) > _LEAST_SLOPE
+
     def across(self, side: Int64) -> Float64:
         """(k,) place of the thread across the path where it runs on the left (-1) or on the right (1) of
         another strand, or alone (0), px."""
@@ -121,15 +127,15 @@ class _Flanks:
         return np.where(unknown | ~np.isfinite(self.across(side)), np.inf, noise)
 
     def told(self, side: Int64) -> Float64:
-        """(m, 2) pixels of the thread beside another strand."""
+        """(m, 2) pixels of the thread beside another strand, but for those along the rows."""
         across = self.across(side)
-        at = (side != 0) & np.isfinite(across)
+        at = (side != 0) & np.isfinite(across) & self.tells_depth
         return self.pixels[at] + across[at, None] * self.normals[at]
 
     def blurred(self, side: Int64) -> Float64:
-        """(m, 2) pixels of the path where nothing tells two strands apart."""
-        is_known = np.isfinite(self.noise(side))
-        return self.pixels[(self.shared | (self.beside != 0)) & ~is_known]
+        """(m, 2) pixels of the path where nothing tells two strands apart, but for those along the rows."""
+        may_be_two = (self.shared | (self.beside != 0)) & ~np.isfinite(self.noise(side))
+        return self.pixels[may_be_two & self.tells_depth]
 
     def unknown(self) -> list[tuple[int, int]]:
         """The stretches in which the thread runs on either side of another strand."""
@@ -152,7 +158,8 @@ def _look(field: Float32, path: Float64, others: Sequence[Float64]) -> _Flanks:
     profiles = search.normal_profiles(field, pixels, tangents, _ACROSS, 0.0)
     tops = _tops(profiles)
     there = pixels[shared, None] + _ACROSS[:, None] * normals[shared, None]
-    tops[shared] &= ~is_near(there.reshape(-1, 2), leading, _ON_PX).reshape(-1, len(_ACROSS))
+    another = is_near(there.reshape(-1, 2), leading, _ON_PX).reshape(-1, len(_ACROSS))
+    tops[shared] &= ~(another & (np.abs(_ACROSS) > _ASIDE_PX))
     edges = [_edges(*p) for p in zip(profiles, tops, shared.tolist(), strict=True)]
     left, right = np.array(edges, np.float64).T
     width: Float64 = (right - left)[alone]
@@ -274,7 +281,7 @@ def _energy(both: list[_Flanks], sides: list[Int64], window: slice) -> float:
         if known.sum() >= _LEAST_KNOWN:
             places = (pixels + across[:, None] * normals)[known]
             energy += shape_energy(places, noise[known] ** 2)
-        told &= known & (np.abs(normals[:, 0]) > _LEAST_SLOPE)
+        told &= known & flanks.tells_depth[window]
         # Along its row a line goes farther aside than across itself.
         slope = np.where(told, normals[:, 0], 1.0)
         disparity += sign * (pixels[:, 0] + across / slope)
