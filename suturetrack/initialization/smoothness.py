@@ -17,6 +17,7 @@ from suturetrack.types import Float64
 ROUGHEST = 3e-5
 """How rough a strand is at most: spectral density of the change of its curvature in an image, 1/px^3."""
 _USUAL = ROUGHEST / 3
+"""And what is taken where it is the same strand in any case."""
 _ROUGHNESSES = tuple(ROUGHEST / 10**k for k in (1.5, 1.0, 0.5, 0.0))
 """Those that are told apart: to a smoother strand it would be a bend where others draw it aside."""
 _LONG, _CLEAR = 40, 0.5
@@ -72,10 +73,9 @@ def roughness(ridges: Ridges) -> float:
     return rough if parts else ROUGHEST
 
 
-def shape_energy(pixels: Float64, variance: Float64, roughness: float = _USUAL) -> float:
-    """How much (k, 2) pixels, with (k,) variances, have to bend as a strand of a roughness."""
-    prior = partial(_curving, roughness=roughness)
-    return _energy(arc_lengths(pixels), pixels, variance, prior)[0]
+def shape_energy(pixels: Float64, variance: Float64) -> float:
+    """How much (k, 2) pixels, with (k,) variances, have to bend as one strand."""
+    return _energy(arc_lengths(pixels), pixels, variance, partial(_curving, roughness=_USUAL))[0]
 
 
 def depth_energy(travelled: Float64, disparities: Float64, variance: Float64) -> float:
