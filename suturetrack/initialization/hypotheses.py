@@ -8,6 +8,7 @@ import numpy as np
 
 from suturetrack.initialization.confidence import AGREED, NEAR_PX, clarity
 from suturetrack.initialization.config import InitializationConfig
+from suturetrack.initialization.contacts import untangled
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.matching import Match, match
 from suturetrack.initialization.segments import Ridges, nearest_segment
@@ -77,21 +78,24 @@ def find_thread(
     """
     matched = match(left.chain.pixels, field.left, field.right, at_infinity, 1)
     apart = (left.chain.pixels - matched.pixels)[matched.inside, 0]
-    if len(apart):
-        depth = Depth.around(apart, field.left, field.right)
-        left = follow_thread(ridges[0], left.origin, config, depth)
-        left = without_other_tails(left, seed)
-        matched = match(left.chain.pixels, field.left, field.right, at_infinity, 1)
     there = matched.pixels[nearest_index(left.chain.pixels, seed)]
     partner, _ = nearest_segment(ridges[1], there, np.inf)
-    if partner is None:
+    right: Thread | None = None
+    if not len(apart):
+        right = None if partner is None else follow_thread(ridges[1], partner, config)
+    else:
+        depths = (
+            Depth.around(apart, field.left, field.right),
+            Depth.around(-apart, field.right, field.left),
+        )
+        left = follow_thread(ridges[0], left.origin, config, depths[0])
+        if partner is not None:
+            right = follow_thread(ridges[1], partner, config, depths[1])
+            left, right = untangled((left, right), ridges, depths, (seed, there))
+        left = without_other_tails(left, seed)
+        matched = match(left.chain.pixels, field.left, field.right, at_infinity, 1)
+    if right is None:
         return Hypothesis(left, None, matched)
-    right = follow_thread(
-        ridges[1],
-        partner,
-        config,
-        Depth.around(-apart, field.right, field.left) if len(apart) else None,
-    )
     right = without_other_tails(right, there)
     first = Hypothesis(left, right, matched)
     if _agreement(matched.pixels[matched.inside], right.chain.pixels) >= AGREED:

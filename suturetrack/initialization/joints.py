@@ -13,6 +13,8 @@ _OUT_OF_REACH = 2.0
 
 Pair = tuple[int, int]
 """Two ends."""
+Way = tuple[int, int]
+"""The end at which a segment is entered, and how many of its points from there on are passed over."""
 
 
 def inward(segments: Sequence[Float64], end: int) -> Float64:
@@ -78,6 +80,44 @@ class Joints:
         if price is not None:
             self.price.setdefault((i, j), price)
             self.price.setdefault((j, i), price)
+
+    def exchanged(self, one: Way, other: Way) -> Joints:
+        """These, but that two strands go on as each other does."""
+        joints = Joints(
+            self.segments.copy(),
+            self.price.copy(),
+            self.free_end,
+            self.partner.copy(),
+            self.bent,
+            self.hidden,
+            self.lead,
+            self._copied,
+        )
+        one_end, other_end = joints._entered(*one), joints._entered(*other)
+        before, others_before = joints.partner[one_end], joints.partner[other_end]
+        joints.join(before, other_end, self.free_end)
+        joints.join(others_before, one_end, self.free_end)
+        return joints
+
+    def _entered(self, entry: int, count: int) -> int:
+        """The end at which the rest of a segment is entered behind so many of its points from an end on; it
+        becomes a segment of its own."""
+        if not count:
+            return entry
+        line, far, rest = inward(self.segments, entry), entry ^ 1, 2 * len(self.segments)
+        self.segments[entry // 2] = line[:count][:: -1 if entry % 2 else 1]
+        self.segments.append(line[count:])
+        if far in self.partner:
+            self.join(rest ^ 1, self.partner.pop(far))
+        moved = {far: rest ^ 1}
+        self.price = {
+            (moved.get(i, i), moved.get(j, j)): cost for (i, j), cost in self.price.items()
+        }
+        self.bent = frozenset(moved.get(end, end) for end in self.bent)
+        self.hidden = {moved.get(end, end) for end in self.hidden}
+        self.lead = {moved.get(end, end): lead for end, lead in self.lead.items()}
+        self.join(far, rest, 0.0)
+        return rest
 
     def join_free(self, pairs: Int64) -> None:
         """Joins those of (m, 2) pairs whose ends are both free, the first first."""

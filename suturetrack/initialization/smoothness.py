@@ -42,6 +42,12 @@ def bend(one: Float64, other: Float64, roughness: float) -> float:
     return _excess(t, (one[::-1], other), variances, partial(_curving, roughness=roughness))
 
 
+def bending(pixels: Float64, roughness: float) -> float:
+    """How much (k, 2) pixels have to bend as one strand of a roughness."""
+    variance = np.full(len(pixels), _NOISE_PX**2)
+    return _energy(arc_lengths(pixels), pixels, variance, partial(_curving, roughness=roughness))[0]
+
+
 def step(one: Disparities, other: Disparities) -> float:
     """How much more the disparity of two arms has to change as one strand than as two."""
     t = arc_lengths(np.r_[one.pixels[::-1], other.pixels])

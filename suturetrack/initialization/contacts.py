@@ -1,0 +1,471 @@
+"""Where a thread touches other strands: whether their ways on had better be exchanged, by both views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import pairwise, product
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from suturetrack.initialization.colours import difference
+from suturetrack.initialization.depth import Depth, Disparities
+from suturetrack.initialization.joints import Joints, Way, inward
+from suturetrack.initialization.segments import Ridges
+from suturetrack.initialization.smoothness import bending, roughness, step
+from suturetrack.initialization.threads import Thread
+from suturetrack.types import Bool, Float64, Int64
+
+_TOUCHING_PX = 3.0
+"""Distance below which two strands draw each other's crests aside."""
+_TOGETHER, _MOST_TOUCHES = 30, 4
+"""Points between two such places up to which these are one contact: what lies between is too short an arm to
+tell by itself; and how many may be one whose sides are told apart."""
+_ARM, _SHAPE, _EVERY = 60, 40, 2
+"""Points of an arm, of those how many tell its shape, and which of these."""
+_SHORTEST_ARM, _LONGEST_GAP = 12, 8
+"""Points of an arm at least, and of a gap in it at most."""
+_SHORTEST_PART = 4
+"""Points of a segment, at least, that are left on each side of where it is divided."""
+_HEADING = 4
+"""Points before and behind the middle of a contact that tell where a strand runs."""
+_FAINT = 0.4
+"""Strength, against the thread's, below which another strand is a vein or a shadow."""
+_STRENGTH = 0.25
+"""By how much the logarithms of the strengths of two arms of one thread differ (standard deviation)."""
+_MOST_BENT, _MOST_STEP, _MOST_RECOLOURED, _MOST_FADED = 24.0, 25.0, 8.0, 8.0
+"""Energy of the bends of two strands, and of a step in depth, in colour, or in strength, at most: an arm that
+ends there fits no other."""
+_CLEARLY = 1.0
+"""Energy by which strands fit together better if exchanged, from which they are."""
+_MOST_EXCHANGES = 4
+_SAME_PX = 10.0
+"""How far from each other, at most, two views show the same contact."""
+_ON_PX, _APART_PX = 3.0, 1.5
+"""How far from its strand, in the median, an arm of the other view is found at most, and how much nearer to
+it than to the other strand at least."""
+_CONTRADICTED = 5.0
+"""Energy from which on two views that are both clear do not mean the same place if they differ."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A strand on one side of a contact."""
+
+    pixels: Float64
+    """(k, 2) from the contact on."""
+    disparities: Disparities | None
+    """None where they cannot be told."""
+    tints: Float64
+    """(k, 3); nothing where the images are gray."""
+    strength: float
+    """Median ||V||."""
+
+    @property
+    def there(self) -> Float64:
+        """(m, 2) pixels in the other view; nothing where they cannot be told."""
+        known = self.disparities
+        if known is None:
+            return np.empty((0, 2))
+        return known.pixels - np.c_[known.value, np.zeros(len(known.value))]
+
+
+Ways = list[tuple[Way, Way]]
+"""Where two strands go on as each other does, the farthest first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """A place at which two strands of one view touch: each comes with one arm and leaves with another."""
+
+    pixels: Float64
+    """(k, 2) of the thread, between its arms."""
+    own: tuple[Arm, Arm]
+    """Of the thread, before and behind it."""
+    other: tuple[Arm, Arm]
+    """Of another strand."""
+    energy: float
+    """By how much less well they would be two strands if they left with each other's arm."""
+    ways: Ways
+    """Where both have to go on as each other does to leave with each other's arm."""
+    sides: Ways
+    """And where to leave with their own, but part in between on each other's side, which fits better; none if
+    that is as it is."""
+
+    @property
+    def disparity(self) -> float:
+        """Median u_own - u_other of all arms, px; NaN where none is known."""
+        known = [a.disparities.value for a in (*self.own, *self.other) if a.disparities is not None]
+        return float(np.median(np.concatenate(known))) if known else np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Meeting:
+    """A place where two strands touch, in the left and in the right view."""
+
+    contacts: tuple[Contact | None, Contact | None]
+    """None where that view alone does not show it, or its arms are not told."""
+    are_same: bool = True
+    """Whether the strands leave it with the same arms in both views."""
+
+    def lead(self, view: int) -> float:
+        """By how much less well, as both views tell, the strands of one would fit if they left it with each
+        other's arm; infinite where that view does not show it."""
+        own, other = self.contacts[view], self.contacts[1 - view]
+        if own is None:
+            return np.inf
+        if other is None:
+            return own.energy
+        return own.energy + (other.energy if self.are_same else -other.energy)
+
+    def ways(self, view: int) -> Ways:
+        """Where the strands of a view had better go on as each other does."""
+        contact = self.contacts[view]
+        if contact is None:
+            return []
+        least = -_CLEARLY if self.are_same else 0.0
+        return contact.ways if self.lead(view) < least else contact.sides
+
+    @property
+    def is_shown_by_both(self) -> bool:
+        """Whether both views tell of it."""
+        return None not in self.contacts
+
+
+def untangled(
+    threads: tuple[Thread, Thread],
+    ridges: tuple[Ridges, Ridges],
+    depths: tuple[Depth, Depth],
+    places: tuple[Float64, Float64],
+) -> tuple[Thread, Thread]:
+    """A thread in the left and in the right view, after exchanging the ways on of strands that touch for as
+    long as both views together ask for that, and with the doubts about these settled.
+
+    Args:
+        threads: as each view by itself has it.
+        ridges: of each view.
+        depths: of arms in each view.
+        places: (2,) pixels on it.
+    """
+    left, right = threads
+    found_left, found_right = map(contacts, threads, ridges, depths)
+    for _ in range(_MOST_EXCHANGES):
+        found = meetings(found_left, found_right)
+        wrong = [meeting for meeting in found if meeting.ways(0) or meeting.ways(1)]
+        if not wrong:
+            break
+        # What one view shows by itself may be put right by what both do.
+        worst = min(wrong, key=lambda m: (not m.is_shown_by_both, min(m.lead(0), m.lead(1))))
+        if worst.ways(0):
+            left = left.exchanged(worst.ways(0), places[0])
+            found_left = contacts(left, ridges[0], depths[0])
+        if worst.ways(1):
+            right = right.exchanged(worst.ways(1), places[1])
+            found_right = contacts(right, ridges[1], depths[1])
+    found = meetings(found_left, found_right)
+    return left.told(_leads(found, 0)), right.told(_leads(found, 1))
+
+
+def _leads(found: list[Meeting], view: int) -> list[tuple[Float64, float]]:
+    """The pixels (k, 2) of all contacts of a view, and their leads."""
+    seen = [(meeting.contacts[view], meeting.lead(view)) for meeting in found]
+    return [(contact.pixels, lead) for contact, lead in seen if contact is not None]
+
+
+def meetings(left: list[Contact], right: list[Contact]) -> list[Meeting]:
+    """The contacts of both views, those of the same place together."""
+    alone, found = list(right), list[Meeting]()
+    for contact in left:
+        partner = _partner(contact, alone)
+        are_same = None if partner is None else _are_same(contact, partner)
+        if partner is None or are_same is None:
+            found.append(Meeting((contact, None)))
+        else:
+            alone.remove(partner)
+            found.append(Meeting((contact, partner), are_same))
+    return found + [Meeting((None, contact)) for contact in alone]
+
+
+def _partner(contact: Contact, others: list[Contact]) -> Contact | None:
+    """That of the other view's contacts which is the same place."""
+    there = contact.pixels - (contact.disparity, 0)
+    if not np.isfinite(there).all() or not others:
+        return None
+    tree = cKDTree(there)
+    apart = [float(np.min(tree.query(other.pixels)[0])) for other in others]
+    nearest = int(np.argmin(apart))
+    return others[nearest] if apart[nearest] < _SAME_PX else None
+
+
+def _are_same(contact: Contact, other: Contact) -> bool | None:
+    """Whether the strands of two views leave a place with the same arms; None where that is not told."""
+    sides = [_side(arm, other) for arm in contact.own]
+    is_same = None if None in sides else sides[0] == sides[1]
+    if is_same is False and min(contact.energy, other.energy) > _CONTRADICTED:
+        return None
+    return is_same
+
+
+def _side(arm: Arm, contact: Contact) -> bool | None:
+    """Whether the arm of another view is one of the thread's; None if it is none of either strand."""
+    if not len(arm.there):
+        return None
+    own, other = (
+        min(np.median(cKDTree(a.pixels).query(arm.there)[0]) for a in arms)
+        for arms in (contact.own, contact.other)
+    )
+    return None if min(own, other) > _ON_PX or abs(own - other) < _APART_PX else bool(own < other)
+
+
+def contacts(thread: Thread, ridges: Ridges, depth: Depth) -> list[Contact]:
+    """Where a thread touches other strands of its view.
+
+    Args:
+        thread: one view's.
+        ridges: of that view.
+        depth: of arms in it.
+    """
+    look, rough = partial(_arm, ridges=ridges, depth=depth), roughness(ridges)
+    own, found = _Line.of(thread.joints, thread.entries), []
+    tree = cKDTree(own.points)
+    for entries in _others(thread):
+        other = _Line.of(thread.joints, entries)
+        is_near = np.asarray(tree.query(other.points)[0]) < _TOUCHING_PX
+        if not is_near.any():
+            continue
+        for touches in _touches(own.points, other.points, _runs(is_near)):
+            line = other
+            if not _run_alike(own.points, other.points, touches):
+                line, touches = _turned(thread.joints, other, touches)
+            contact = _contact(own, line, touches, look, rough)
+            if contact is not None:
+                found.append(contact)
+    return found
+
+
+_Touch = tuple[tuple[int, int], tuple[int, int]]
+"""The first point, and that behind the last one, of the stretches of two lines that touch there."""
+
+
+def _touches(own: Float64, other: Float64, others: list[tuple[int, int]]) -> Iterator[list[_Touch]]:
+    """Where two lines (k, 2) and (m, 2) touch, of the second in those runs, in order along the first; what is
+    near together at once."""
+    distance, nearest = map(np.asarray, cKDTree(other).query(own))
+    found: list[_Touch] = []
+    for start, stop in _runs(distance < _TOUCHING_PX):
+        if found and start - found[-1][0][1] >= _TOGETHER:
+            yield found
+            found = []
+        first, last = sorted((int(nearest[start]), int(nearest[stop - 1])))
+        first = min([first, *(a for a, b in others if a <= first < b)])
+        last = max([last + 1, *(b for a, b in others if a <= last < b)])
+        found.append(((start, stop), (first, last)))
+    if found:
+        yield found
+
+
+def _runs(flags: Bool) -> list[tuple[int, int]]:
+    """The first, and that behind the last one, of runs of flags."""
+    bounds = np.flatnonzero(np.diff(flags, prepend=False, append=False))
+    return [(int(start), int(stop)) for start, stop in bounds.reshape(-1, 2)]
+
+
+def _whole(touches: list[_Touch]) -> _Touch:
+    """All of some touches as one."""
+    own, other = ([touch[line] for touch in touches] for line in (0, 1))
+    return (
+        (own[0][0], own[-1][1]),
+        (min(start for start, _ in other), max(stop for _, stop in other)),
+    )
+
+
+def _run_alike(own: Float64, other: Float64, touches: list[_Touch]) -> bool:
+    """Whether two lines run in the same direction where they touch."""
+    headings = []
+    for line, (start, stop) in zip((own, other), _whole(touches), strict=True):
+        middle = (start + stop) // 2
+        ahead = line[min(middle + _HEADING, len(line) - 1)]
+        headings.append(ahead - line[max(middle - _HEADING, 0)])
+    return bool(headings[0] @ headings[1] >= 0)
+
+
+def _turned(joints: Joints, line: _Line, touches: list[_Touch]) -> tuple[_Line, list[_Touch]]:
+    """A line that others touch from its other end on."""
+    count = len(line.points)
+    turned = _Line.of(joints, [entry ^ 1 for entry in line.entries[::-1]])
+    return turned, [(own, (count - stop, count - start)) for own, (start, stop) in touches]
+
+
+def _others(thread: Thread) -> Iterator[list[int]]:
+    """The ends at which the segments of every other strand are entered."""
+    seen = {entry // 2 for entry in thread.entries}
+    for k in range(len(thread.joints.segments)):
+        if k not in seen:
+            entries = thread.joints.follow(k)
+            seen |= {entry // 2 for entry in entries}
+            yield entries
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """The points of a strand."""
+
+    entries: list[int]
+    points: Float64
+    """(n, 2)."""
+    segment: Int64
+    """(n,) of which of its segments each point is."""
+    sizes: list[int]
+    """Points of each segment; those behind are in the gap to the next."""
+
+    @classmethod
+    def of(cls, joints: Joints, entries: list[int]) -> _Line:
+        pieces = [inward(joints.segments, entry) for entry in entries]
+        bridged = [_bridged(a, b) for a, b in pairwise(pieces)] + pieces[-1:]
+        return cls(
+            entries,
+            np.concatenate(bridged),
+            np.repeat(np.arange(len(pieces)), [len(piece) for piece in bridged]),
+            [len(piece) for piece in pieces],
+        )
+
+    @cached_property
+    def _gaps(self) -> list[tuple[int, int]]:
+        """The long ones: the first point in each, and that behind the last one."""
+        starts = np.searchsorted(self.segment, np.arange(len(self.sizes)))
+        stops = np.r_[starts[1:], len(self.segment)]
+        gaps = zip((starts + self.sizes).tolist(), stops.tolist(), strict=True)
+        return [(start, stop) for start, stop in gaps if stop - start > _LONGEST_GAP]
+
+    def before(self, place: int) -> Float64:
+        """(k, 2) the points before one, backwards, as far as a gap."""
+        gap = max((stop for _, stop in self._gaps if stop <= place), default=0)
+        return self.points[max(gap, place - _ARM) : place][::-1]
+
+    def behind(self, place: int) -> Float64:
+        """(k, 2) the points from one on, as far as a gap."""
+        gap = min((start for start, _ in self._gaps if start >= place), default=len(self.points))
+        return self.points[place : min(gap, place + _ARM)]
+
+    def between(self, start: int, stop: int) -> Float64:
+        """(k, 2) the points from one to another; none over a gap."""
+        is_seen = all(gap_stop <= start or gap_start >= stop for gap_start, gap_stop in self._gaps)
+        return self.points[start : stop if is_seen else start]
+
+    def way(self, start: int, stop: int) -> Way:
+        """How it goes on behind a stretch: by the last joint there, or through a segment."""
+        k = int(self.segment[stop])
+        passed = stop - int(np.argmax(self.segment == k))
+        if passed > self.sizes[k] - _SHORTEST_PART and k + 1 < len(self.entries):
+            return self.entries[k + 1], 0
+        return self.entries[k], 0 if passed < _SHORTEST_PART or self.segment[start] < k else passed
+
+
+def _bridged(piece: Float64, following: Float64) -> Float64:
+    """A piece of a line with points over the gap to that which follows."""
+    count = int(np.linalg.norm(following[0] - piece[-1]))
+    share = np.arange(1, count)[:, None] / max(count, 1)
+    return np.concatenate([piece, piece[-1] + share * (following[0] - piece[-1])])
+
+
+_Look = Callable[[Float64], Arm]
+
+
+def _contact(
+    own: _Line, other: _Line, touches: list[_Touch], look: _Look, rough: float
+) -> Contact | None:
+    """That of two lines which touch, if their arms are long enough to tell."""
+    lines = own, other
+    whole = _whole(touches)
+    before = [line.before(start) for line, (start, _) in zip(lines, whole, strict=True)]
+    behind = [line.behind(stop) for line, (_, stop) in zip(lines, whole, strict=True)]
+    if min(map(len, (*before, *behind))) < _SHORTEST_ARM:
+        return None
+    arms = [look(piece) for piece in before], [look(piece) for piece in behind]
+    if max(arm.strength for arm in (arms[0][1], arms[1][1])) < _FAINT * arms[0][0].strength:
+        return None
+    if len(touches) > _MOST_TOUCHES or not _are_apart(lines, touches):
+        touches = [whole]
+    pieces = [
+        [piece[:_SHAPE:_EVERY][::-1] for piece in before],
+        *(
+            [
+                line.between(stop, start)[::_EVERY]
+                for line, (_, stop), (start, _) in zip(lines, one, two, strict=True)
+            ]
+            for one, two in pairwise(touches)
+        ),
+        [piece[:_SHAPE:_EVERY] for piece in behind],
+    ]
+    # At each touch the strands may cross, or not.
+    crossed = sorted(product((False, True), repeat=len(touches)), key=sum)
+    apart = sum(bending(piece, rough) for both in pieces for piece in both if len(piece))
+    energies = np.array([_bending(pieces, ways, rough) - apart for ways in crossed])
+    is_odd = np.array([sum(ways) % 2 for ways in crossed], bool)
+    change = _change(*arms[0], *arms[1])
+    even, odd = (int(np.where(which, energies, np.inf).argmin()) for which in (~is_odd, is_odd))
+    bends = np.minimum(energies[[even, odd]], _MOST_BENT)
+    energy = bends[1] - bends[0] + change
+    if energies[even] > energies[0] - _CLEARLY:
+        even = 0
+    return Contact(
+        own.points[slice(*whole[0])],
+        (arms[0][0], arms[1][0]),
+        (arms[0][1], arms[1][1]),
+        float(energy),
+        *(
+            [
+                (own.way(*at), other.way(*there))
+                for (at, there), is_crossed in zip(touches, crossed[which], strict=True)
+                if is_crossed
+            ][::-1]
+            for which in (odd, even)
+        ),
+    )
+
+
+def _are_apart(lines: tuple[_Line, _Line], touches: list[_Touch]) -> bool:
+    """Whether both lines pass the touches in order, and go on behind each in a way of its own."""
+    starts = [start for _, (start, _) in touches]
+    ways = [[line.way(*touch[k]) for touch in touches] for k, line in enumerate(lines)]
+    return starts == sorted(starts) and all(len(set(each)) == len(touches) for each in ways)
+
+
+def _bending(pieces: list[list[Float64]], crossed: tuple[bool, ...], rough: float) -> float:
+    """Energy of two strands that go on from piece to piece, and cross from each other's to each other's where
+    they touch."""
+    sides = np.cumsum([0, *crossed]) % 2
+    return sum(
+        bending(
+            np.concatenate([both[side ^ k] for both, side in zip(pieces, sides, strict=True)]),
+            rough,
+        )
+        for k in (0, 1)
+    )
+
+
+def _change(before: Arm, others_before: Arm, behind: Arm, others_behind: Arm) -> float:
+    """By how much more two strands change if they leave a place with each other's arm."""
+    return (
+        _misfit(before, others_behind)
+        + _misfit(others_before, behind)
+        - _misfit(before, behind)
+        - _misfit(others_before, others_behind)
+    )
+
+
+def _arm(pixels: Float64, ridges: Ridges, depth: Depth) -> Arm:
+    """What a view shows of (k, 2) pixels of a strand."""
+    tints = np.empty((0, 3)) if ridges.tints is None else ridges.tints.along(pixels)
+    return Arm(pixels, depth.along(pixels), tints, float(np.median(ridges.sample(pixels))))
+
+
+def _misfit(one: Arm, other: Arm) -> float:
+    """Energy by which two arms are less well one strand than two, but for their shapes."""
+    energy = min(difference(one.tints, other.tints), _MOST_RECOLOURED)
+    if one.disparities is not None and other.disparities is not None:
+        energy += min(step(one.disparities, other.disparities), _MOST_STEP)
+    ratio = np.log(max(one.strength, 1e-6) / max(other.strength, 1e-6))
+    return energy + min(0.5 * float(ratio / _STRENGTH) ** 2, _MOST_FADED)
