@@ -102,7 +102,7 @@ def test_strands_that_are_right_stay(rig: StereoRig) -> None:
 
 
 def contact_of(energy: float) -> Contact:
-    arm = Arm(np.zeros((20, 2)), None, np.empty((0, 3)), 1.0)
+    arm = Arm(np.zeros((20, 2)), None, None, np.empty((0, 3)), 1.0)
     return Contact(np.zeros((3, 2)), (arm, arm), (arm, arm), energy, [((1, 0), (3, 0))], [])
 
 

@@ -15,6 +15,7 @@ from suturetrack.initialization.doubts import (
     HIDDEN,
     SHARED,
     SHARP,
+    TOUCHES,
     Doubt,
 )
 from suturetrack.initialization.result import PlacedDoubts, in_words, remaining
@@ -203,7 +204,7 @@ def _settled(doubts: list[Doubt], line: Float64, ridges: Ridges) -> list[Doubt]:
     for doubt in doubts:
         near = _near(doubt, line)
         if (
-            doubt.why in (*FOREIGN, BEYOND, HIDDEN)
+            doubt.why in (*FOREIGN, BEYOND, HIDDEN, TOUCHES)
             or not _is_one_pass(line, near)
             or not _is_all_ridge(doubt.place, line, near, ridges)
         ):
@@ -230,7 +231,9 @@ def _placed(
         at = nearest_index(line, place)
         there = counterpart[at]
         both = max(rest, min(_same(why, there, doubts[1 - view]), default=1.0))
-        if why == SHARED or not _is_shared(place, line, counterpart, chains[1 - view].pixels):
+        if why in (SHARED, TOUCHES) or not _is_shared(
+            place, line, counterpart, chains[1 - view].pixels
+        ):
             left = rest
         elif why != SHARP and both < _GRAVE:
             left = both
@@ -330,8 +333,8 @@ def _is_near(where: Float64, places: Float64) -> bool:
 
 
 def _distinct(chain: Chain) -> list[Doubt]:
-    """The doubts, the gravest first, one of a kind for each place: about other threads, about stretches that
-    strands share, about parts beyond gaps, and all the rest."""
+    """The doubts, the gravest first, one of a kind for each place: about other threads, about strands
+    that touch or share a stretch, about parts beyond gaps, and all the rest."""
     kept: list[Doubt] = []
     for doubt in sorted(chain.doubts, key=lambda d: d.rest):
         alike = [d.place for d in kept if _kind(d.why) == _kind(doubt.why)]
@@ -343,7 +346,7 @@ def _distinct(chain: Chain) -> list[Doubt]:
 def _kind(why: str) -> str:
     if why in FOREIGN:
         return FOREIGN[0]
-    return why if why in (BEYOND, SHARED) else CROSSING
+    return why if why in (BEYOND, SHARED, TOUCHES) else CROSSING
 
 
 def _agreement(pixels: Float64, chain: Float64, rig: StereoRig) -> float:

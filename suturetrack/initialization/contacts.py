@@ -27,6 +27,8 @@ _ARM, _SHAPE, _EVERY = 60, 40, 2
 """Points of an arm, of those how many tell its shape, and which of these."""
 _SHORTEST_ARM, _LONGEST_GAP = 12, 8
 """Points of an arm at least, and of a gap in it at most."""
+_CLEAR_PX, _LEAST_TOLD = 5.0, 5
+"""Distance from the other strand from which a point tells its depth, and how many do at least."""
 _SHORTEST_PART = 4
 """Points of a segment, at least, that are left on each side of where it is divided."""
 _HEADING = 4
@@ -58,6 +60,8 @@ class Arm:
     """(k, 2) from the contact on."""
     disparities: Disparities | None
     """None where they cannot be told."""
+    clear: Disparities | None
+    """Those of them that the other strand is too far away to be taken for."""
     tints: Float64
     """(k, 3); nothing where the images are gray."""
     strength: float
@@ -370,7 +374,7 @@ def _bridged(piece: Float64, following: Float64) -> Float64:
     return np.concatenate([piece, piece[-1] + share * (following[0] - piece[-1])])
 
 
-_Look = Callable[[Float64], Arm]
+_Look = Callable[[Float64, Float64], Arm]
 
 
 def _contact(
@@ -383,7 +387,8 @@ def _contact(
     behind = [line.behind(stop) for line, (_, stop) in zip(lines, whole, strict=True)]
     if min(map(len, (*before, *behind))) < _SHORTEST_ARM:
         return None
-    arms = [look(piece) for piece in before], [look(piece) for piece in behind]
+    beside = other.points, own.points
+    arms = list(map(look, before, beside)), list(map(look, behind, beside))
     if max(arm.strength for arm in (arms[0][1], arms[1][1])) < _FAINT * arms[0][0].strength:
         return None
     if len(touches) > _MOST_TOUCHES or not _are_apart(lines, touches):
@@ -456,16 +461,22 @@ def _change(before: Arm, others_before: Arm, behind: Arm, others_behind: Arm) ->
     )
 
 
-def _arm(pixels: Float64, ridges: Ridges, depth: Depth) -> Arm:
-    """What a view shows of (k, 2) pixels of a strand."""
+def _arm(pixels: Float64, other: Float64, ridges: Ridges, depth: Depth) -> Arm:
+    """What a view shows of (k, 2) pixels of a strand that touches another one, (m, 2)."""
     tints = np.empty((0, 3)) if ridges.tints is None else ridges.tints.along(pixels)
-    return Arm(pixels, depth.along(pixels), tints, float(np.median(ridges.sample(pixels))))
+    strength = float(np.median(ridges.sample(pixels)))
+    known = clear = depth.along(pixels)
+    if known is not None:
+        is_clear = np.asarray(cKDTree(other).query(known.pixels)[0]) > _CLEAR_PX
+        clear = Disparities(known.pixels[is_clear], known.value[is_clear], known.variance[is_clear])
+    is_told = clear is not None and len(clear.value) >= _LEAST_TOLD
+    return Arm(pixels, known, clear if is_told else None, tints, strength)
 
 
 def _misfit(one: Arm, other: Arm) -> float:
     """Energy by which two arms are less well one strand than two, but for their shapes."""
     energy = min(difference(one.tints, other.tints), _MOST_RECOLOURED)
-    if one.disparities is not None and other.disparities is not None:
-        energy += min(step(one.disparities, other.disparities), _MOST_STEP)
+    if one.clear is not None and other.clear is not None:
+        energy += min(step(one.clear, other.clear), _MOST_STEP)
     ratio = np.log(max(one.strength, 1e-6) / max(other.strength, 1e-6))
     return energy + min(0.5 * float(ratio / _STRENGTH) ** 2, _MOST_FADED)

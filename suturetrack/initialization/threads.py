@@ -20,6 +20,7 @@ from suturetrack.initialization.doubts import (
     FADES,
     RECOLOURED,
     SHARED,
+    TOUCHES,
     Doubt,
     doubts,
     is_beyond_gap,
@@ -133,7 +134,7 @@ class Thread:
             ]
             if lead < _CLEAR_LEAD:
                 rest = float(expit(lead - _DOUBTFUL_LEAD))
-                doubts.append(Doubt(pixels[len(pixels) // 2], SHARED, rest))
+                doubts.append(Doubt(pixels[len(pixels) // 2], TOUCHES, rest))
         return replace(self, chain=replace(self.chain, doubts=tuple(doubts)))
 
     @property
