@@ -155,6 +155,7 @@ def untangled(
     """
     left, right = threads
     found_left, found_right = map(contacts, threads, ridges, depths)
+    decided = list[Meeting]()
     for _ in range(_MOST_EXCHANGES):
         found = meetings(found_left, found_right)
         wrong = [meeting for meeting in found if meeting.ways(0) or meeting.ways(1)]
@@ -162,6 +163,7 @@ def untangled(
             break
         # What one view shows by itself may be put right by what both do.
         worst = min(wrong, key=lambda m: (not m.is_shown_by_both, min(m.lead(0), m.lead(1))))
+        decided.append(worst)
         if worst.ways(0):
             left = left.exchanged(worst.ways(0), places[0])
             found_left = contacts(left, ridges[0], depths[0])
@@ -169,7 +171,12 @@ def untangled(
             right = right.exchanged(worst.ways(1), places[1])
             found_right = contacts(right, ridges[1], depths[1])
     found = meetings(found_left, found_right)
-    return left.told(_leads(found, 0)), right.told(_leads(found, 1))
+    # An exchange is no surer than what it was decided by.
+    leads = [
+        [*_leads(found, view), *((pixels, abs(lead)) for pixels, lead in _leads(decided, view))]
+        for view in (0, 1)
+    ]
+    return left.told(leads[0]), right.told(leads[1])
 
 
 def _leads(found: list[Meeting], view: int) -> list[tuple[Float64, float]]:
