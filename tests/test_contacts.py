@@ -9,9 +9,10 @@ import pytest
 
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import InitializationConfig, initialize
-from suturetrack.initialization.contacts import Arm, Contact, Meeting, contacts, untangled
+from suturetrack.initialization.contacts import Arm, Contact, contacts
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.joints import Joints
+from suturetrack.initialization.meetings import Meeting, untangled
 from suturetrack.initialization.segments import Ridges, find_ridges
 from suturetrack.initialization.threads import Chain, Thread, follow_thread
 from suturetrack.metrics import curve_error

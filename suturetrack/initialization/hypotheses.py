@@ -8,9 +8,9 @@ import numpy as np
 
 from suturetrack.initialization.confidence import AGREED, NEAR_PX, clarity
 from suturetrack.initialization.config import InitializationConfig
-from suturetrack.initialization.contacts import untangled
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.matching import Match, match
+from suturetrack.initialization.meetings import untangled
 from suturetrack.initialization.segments import Ridges, nearest_segment
 from suturetrack.initialization.threads import Chain, Thread, follow_thread, without_other_tails
 from suturetrack.polylines import coverage, nearest_index, polyline_distances
