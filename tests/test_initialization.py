@@ -20,6 +20,7 @@ from suturetrack.initialization import (
     remaining,
 )
 from suturetrack.initialization.arms import Arms
+from suturetrack.initialization.colours import darkening
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.crest import View, find_crest
 from suturetrack.initialization.depth import Depth
@@ -575,6 +576,15 @@ def test_a_thread_whose_end_lies_on_a_fainter_one_ends_there(seed: int, rig: str
     assert max(error.ends) < 1
 
 
+def test_a_thread_that_goes_on_in_the_shade_is_found_whole() -> None:
+    """It is far fainter there, as a vein is; but it has its colour, and is darker."""
+    scene = open_scene("clutter", 4415, "endoscope")
+    field, start = field_and_seed(scene)
+    error = curve_error(dense(initialize(field, scene.rig, start).curve), scene.truth(0)[0].points)
+    assert error.rms < 0.3
+    assert max(error.ends) < 1
+
+
 def painted(strands: list[tuple[Float64, tuple[int, int, int]]], rig: StereoRig) -> RidgeField:
     """The field of strands (k, 2) of some colours, the last one on top, at one depth, on gray ground."""
     views = []
@@ -684,6 +694,16 @@ def test_where_threads_touch_each_goes_on_in_its_own_colour(rig: StereoRig) -> N
     assert polyline_distances(found, upper).max() < 2
     gray = rig.project(dense(initialize(replace(field, colours=None), rig, seed).curve))[0]
     assert polyline_distances(gray, upper).max() > 20
+
+
+def test_shade_is_told_from_another_colour() -> None:
+    """Tints are two differences of colours, which light leaves alone, and the brightness."""
+    lit, shade = np.tile([0.1, -0.2, 4.0], (40, 1)), np.tile([0.1, -0.2, 3.4], (100, 1))
+    assert darkening(lit, shade) == pytest.approx(0.6)
+    assert darkening(shade, lit) == pytest.approx(-0.6)
+    assert np.isnan(darkening(lit, shade + np.array([0.3, 0, 0])))
+    assert np.isnan(darkening(lit, shade[:5]))
+    assert np.isnan(darkening(lit, shade * np.nan))
 
 
 def test_colours_are_known_of_views_that_are_reduced_or_raised() -> None:

@@ -18,6 +18,8 @@ _WITHIN = np.array([0.08, 0.08, 0.35])
 """By how much the tints of two arms of one thread differ (standard deviation)."""
 _COMMON = 8.0
 """Energy that differences within one thread hardly exceed: up to there they say nothing."""
+_ALIKE = 0.16
+"""Difference of each of the two that light leaves alone, up to which arms are alike."""
 _SHORTEST_ARM = 8
 """Points that tell the tint of an arm, at least."""
 _STEADY = np.array([0.04, 0.04, 0.15])
@@ -69,6 +71,15 @@ def difference(one: Float64, other: Float64) -> float:
     step = (np.median(one, axis=0) - np.median(other, axis=0)) / _WITHIN
     energy = 0.5 * float(step @ step) - _COMMON
     return max(energy, 0.0) if np.isfinite(step).all() else 0.0
+
+
+def darkening(one: Float64, other: Float64) -> float:
+    """By how much the logarithm of the brightness is less in the second of two arms, tints (k, 3) and (m, 3);
+    nan where it is not known, or the arms differ in more than that."""
+    if min(len(one), len(other)) < _SHORTEST_ARM:
+        return np.nan
+    step = np.median(one, axis=0) - np.median(other, axis=0)
+    return float(step[-1]) if np.all(abs(step[:-1]) < _ALIKE) else np.nan
 
 
 def another_begins(tints: Float64, first: int) -> int:

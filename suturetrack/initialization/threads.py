@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from suturetrack.initialization.colours import another_begins
+from suturetrack.initialization.colours import another_begins, darkening
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.doubts import (
@@ -42,6 +42,9 @@ _FALL = 0.5
 """Ratio of the strengths behind and before such an end at most: threads fade more slowly."""
 _STEP, _LOWER = 0.7, 0.85
 """That ratio and that share where a strand that ends on the thread may be what goes on."""
+_IN_SHADE, _STEADY = 100, 0.2
+"""Points of what has the colour of the thread, and goes on where it ends, from which it is the thread in the
+shade, and by how much brighter or darker it may be all the same (of the logarithm)."""
 _CUT = {FADES: 0.49, RECOLOURED: 0.2}
 """What is left of the confidence in an end at which a vein goes on, or another thread: below that one it may
 lie hidden."""
@@ -66,6 +69,8 @@ _AT_CONTACT_PX = 15.0
 _CLEAR_LEAD, _DOUBTFUL_LEAD = 7.0, 2.0
 """Energy by which strands have to fit together less well if exchanged for no doubt to be left, and what
 halves the confidence: of 1,417 contacts above 5 none was wrong, of 57 below 2 fifteen were."""
+_SIDE = 40
+"""Points on each side of an end whose colour counts."""
 _WINDOW, _STEP_POINTS = 10, 3
 """Points whose strength counts on each side of an end, and those about it that do not."""
 
@@ -255,10 +260,24 @@ def _stops_at(
             # What goes on is that strand if it is more like that one than like the thread.
             fallen = min(_LOWER, float(np.sqrt(level / own)))
             stops.append(_falls_at(strength, start, _STEP, fallen))
+    stop = min(stops)
     # The strength tells an end below another thread, too, the colour only where that begins to hide it.
-    if min(stops) < len(pixels) or ridges.tints is None:
-        return min(stops), FADES
+    if stop < len(pixels) or ridges.tints is None:
+        is_fall = stop == stops[0]
+        is_shaded = is_fall and _goes_on_in_the_shade(ridges, pixels[:stop], pixels[stop:])
+        return len(pixels) if is_shaded else stop, FADES
     return another_begins(ridges.tints.along(pixels), first), RECOLOURED
+
+
+def _goes_on_in_the_shade(ridges: Ridges, before: Float64, behind: Float64) -> bool:
+    """Whether what is fainter behind an end, (m, 2) pixels from there on, is the thread (k, 2) all the same:
+    the light then falls no more than the contrast does, which falls with it or with its square."""
+    if ridges.tints is None or len(behind) < _IN_SHADE:
+        return False
+    sides = before[-_SIDE:-_STEP_POINTS], behind[_STEP_POINTS:_IN_SHADE]
+    lit, shaded = (float(np.median(ridges.sample(side))) for side in sides)
+    darker = darkening(*map(ridges.tints.along, sides))
+    return bool(-_STEADY < darker < _STEADY + max(np.log(lit / shaded), 0.0))
 
 
 def _strands_met(thread: Thread) -> list[tuple[Float64, float]]:
@@ -302,6 +321,11 @@ def _without_faint_ends(
             level = np.average([strength[e] for e in rest], weights=sizes)
             is_faint = strength[last] <= _FAINT * level
             is_short = len(segments[last // 2]) < _SPECK
+            if is_faint and _goes_on_in_the_shade(
+                ridges,
+                *(np.concatenate([inward(segments, e) for e in part]) for part in (rest, [last])),
+            ):
+                break
             if not (is_faint or (is_short and is_beyond_gap(joints, last ^ leaves, ridges))):
                 break
             entries = rest

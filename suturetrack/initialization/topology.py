@@ -98,14 +98,15 @@ def _facing(ends: list[int], ridges: Ridges) -> list[Pair]:
     arms = [inward(ridges.segments, end)[: ARM + 1] for end in ends]
     places = np.array([arm[0] for arm in arms])
     heading = unit(places - [arm[-1] for arm in arms])
-    strength = np.array([np.median(ridges.sample(ridges.segments[end // 2])) for end in ends])
+    # Behind what hides it the ground may be another one, for all of the strand or for its last points.
+    wholes = [ridges.segments[end // 2] for end in ends]
+    strengths = np.array([[np.median(ridges.sample(p)) for p in parts] for parts in (wholes, arms)])
     a, b = cKDTree(places).query_pairs(_LONGEST_HIDDEN_PX, output_type="ndarray").T
     way = places[b] - places[a]
     facing = np.minimum((heading[a] * way).sum(1), -(heading[b] * way).sum(1))
     is_pair = facing > _FACING * np.linalg.norm(way, axis=1)
-    is_pair &= np.minimum(strength[a], strength[b]) > _AS_STRONG * np.maximum(
-        strength[a], strength[b]
-    )
+    least, most = strengths.min(0), strengths.max(0)
+    is_pair &= np.minimum(most[a] / least[b], most[b] / least[a]) > _AS_STRONG
     return [(ends[i], ends[j]) for i, j in zip(a[is_pair], b[is_pair], strict=True)]
 
 
