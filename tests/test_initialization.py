@@ -328,6 +328,15 @@ def test_a_thread_that_ends_on_another_one_far_from_its_end_is_not_taken_for_a_b
     assert abs(curve_error(dense(found.curve), one).length_percent) < 3
 
 
+def test_a_thread_that_ends_across_another_one_near_its_end_does_not_turn_round_there() -> None:
+    """What leads from there to the other one's end looks like a stub."""
+    scene = open_scene("clutter", 4410, "endoscope")
+    field, start = field_and_seed(scene)
+    error = curve_error(dense(initialize(field, scene.rig, start).curve), scene.truth(0)[0].points)
+    assert error.rms < 0.3
+    assert max(error.ends) < 1
+
+
 def sharp_corner(rig: StereoRig, arm_px: float) -> Float64:
     """(1400, 3) a thread that turns back at 60 degrees to an arm of that length."""
     t, tip = np.linspace(0, 1, 700)[:, None], np.array([220.0, 190.0])

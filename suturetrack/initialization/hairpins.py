@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from suturetrack.initialization.joints import Joints
+from suturetrack.initialization.joints import Joints, inward
 from suturetrack.initialization.pricing import FEW_ENDS, HIGHEST
+from suturetrack.initialization.segments import ARM
+from suturetrack.polylines import unit
 
 _LONGEST = 60
 """Points of a stub at most."""
+_CLEAR = 4
+"""Points at the ends of two strands that draw each other's crests aside there."""
+_TOGETHER = 0.7
+"""Cosine of the angle at which they come together at most."""
 _SMOOTH = 0.5
 """Price of a merge up to which a strand runs on smoothly into a stub."""
 _SHARP = 1.4
@@ -31,11 +37,21 @@ def double_stubs(joints: Joints) -> None:
             and waiting not in partner
             and waiting not in (mouth ^ 1, joints.other_end(mouth ^ 1))
             and max(cost, price[mouth, partner[mouth]]) < most
+            and _come_together(joints, partner[mouth], waiting)
         ]
         if not ways:
             return
         _, mouth, waiting = min(ways)
         _double(joints, mouth, waiting)
+
+
+def _come_together(joints: Joints, one: int, other: int) -> bool:
+    """Whether the strands of two ends come to them at a small angle."""
+    arms = [inward(joints.segments, end)[_CLEAR : ARM + _CLEAR] for end in (one, other)]
+    if min(map(len, arms)) < 2:
+        return True
+    headings = [unit(arm[0] - arm[-1]) for arm in arms]
+    return bool(headings[0] @ headings[1] > _TOGETHER)
 
 
 def _double(joints: Joints, mouth: int, waiting: int) -> None:
