@@ -451,9 +451,8 @@ def test_a_crossing_that_neither_view_can_tell_is_doubtful() -> None:
     scene = open_scene("clutter", 250)
     field, start = field_and_seed(scene)
     found = initialize(field, scene.rig, start)
-    is_right = curve_error(dense(found.curve), scene.truth(0)[0].points).rms < 0.3
-    assert (found.confidence >= 0.5) == is_right
-    assert is_right or any("another strand that it touches" in reason for reason in found.reasons)
+    assert found.confidence < 0.5
+    assert any("another strand that it touches" in reason for reason in found.reasons)
 
 
 @pytest.mark.parametrize(
