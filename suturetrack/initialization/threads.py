@@ -278,7 +278,8 @@ def _goes_on_in_the_shade(ridges: Ridges, before: Float64, behind: Float64) -> b
     sides = before[-_SIDE:-_STEP_POINTS], behind[_STEP_POINTS:_IN_SHADE]
     lit, shaded = (float(np.median(ridges.sample(side))) for side in sides)
     darker = darkening(*map(ridges.tints.along, sides))
-    return bool(-_STEADY < darker < _STEADY + max(np.log(lit / shaded), 0.0))
+    fainter = np.log(max(lit, 1e-6) / max(shaded, 1e-6))
+    return bool(-_STEADY < darker < _STEADY + max(fainter, 0.0))
 
 
 def _strands_met(thread: Thread) -> list[tuple[Float64, float]]:
@@ -320,13 +321,10 @@ def _without_faint_ends(
             last, rest = entries[-1], entries[:-1]
             sizes = [len(segments[e // 2]) for e in rest]
             level = np.average([strength[e] for e in rest], weights=sizes)
+            parts = [np.concatenate([inward(segments, e) for e in part]) for part in (rest, [last])]
             is_faint = strength[last] <= _FAINT * level
+            is_faint = is_faint and not _goes_on_in_the_shade(ridges, *parts)
             is_short = len(segments[last // 2]) < _SPECK
-            if is_faint and _goes_on_in_the_shade(
-                ridges,
-                *(np.concatenate([inward(segments, e) for e in part]) for part in (rest, [last])),
-            ):
-                break
             if not (is_faint or (is_short and is_beyond_gap(joints, last ^ leaves, ridges))):
                 break
             entries = rest

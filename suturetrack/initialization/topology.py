@@ -105,8 +105,8 @@ def _facing(ends: list[int], ridges: Ridges) -> list[Pair]:
     way = places[b] - places[a]
     facing = np.minimum((heading[a] * way).sum(1), -(heading[b] * way).sum(1))
     is_pair = facing > _FACING * np.linalg.norm(way, axis=1)
-    least, most = strengths.min(0), strengths.max(0)
-    is_pair &= np.minimum(most[a] / least[b], most[b] / least[a]) > _AS_STRONG
+    least, most = _AS_STRONG * strengths.min(0), strengths.max(0)
+    is_pair &= (most[a] > least[b]) & (most[b] > least[a])
     return [(ends[i], ends[j]) for i, j in zip(a[is_pair], b[is_pair], strict=True)]
 
 
