@@ -221,12 +221,14 @@ class _Line:
         return [(start, stop) for start, stop in gaps if stop - start > _LONGEST_GAP]
 
     def before(self, place: int) -> Float64:
-        """(k, 2) the points before one, backwards, as far as a gap."""
+        """(k, 2) the points before one, or before the gap that it is in, backwards, as far as a gap."""
+        place = min([start for start, stop in self._gaps if start < place < stop], default=place)
         gap = max((stop for _, stop in self._gaps if stop <= place), default=0)
         return self.points[max(gap, place - _ARM) : place][::-1]
 
     def behind(self, place: int) -> Float64:
-        """(k, 2) the points from one on, as far as a gap."""
+        """(k, 2) the points from one, or from behind the gap that it is in, on, as far as a gap."""
+        place = max([stop for start, stop in self._gaps if start <= place < stop], default=place)
         gap = min((start for start, _ in self._gaps if start >= place), default=len(self.points))
         return self.points[place : min(gap, place + _ARM)]
 
