@@ -66,7 +66,7 @@ _SETTLED = CROSSING, SHARED
 """What is doubted about a contact until both views have told of it."""
 _AT_CONTACT_PX = 15.0
 """How far from it."""
-_CLEAR_LEAD, _DOUBTFUL_LEAD, _LEAD = 7.0, 2.5, 1.5
+_CLEAR_LEAD, _DOUBTFUL_LEAD, _LEAD = 7.0, 3.0, 1.5
 """Energy by which strands have to fit together less well if exchanged for no doubt to be left, what halves
 the confidence, and the unit: of 1,437 contacts above 7 one was wrong, of 56 from 2 to 7 nine, of 31 below 2
 ten."""
