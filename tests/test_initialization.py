@@ -79,6 +79,15 @@ def field_and_seed(scene: Scene, thread: str = "0") -> tuple[RidgeField, Seed]:
     return segmenter.step(frame), seed
 
 
+def assert_is_found_whole(scenario: str, seed: int, rig: str) -> None:
+    """To 0.3 mm, and its ends to 1 mm."""
+    scene = open_scene(scenario, seed, rig)
+    field, start = field_and_seed(scene)
+    error = curve_error(dense(initialize(field, scene.rig, start).curve), scene.truth(0)[0].points)
+    assert error.rms < 0.3
+    assert max(error.ends) < 1
+
+
 def dense(curve: Nurbs, count: int = 1500) -> Float64:
     return nurbs.evaluate(curve, nurbs.evenly_spaced(curve, count))
 
@@ -330,11 +339,7 @@ def test_a_thread_that_ends_on_another_one_far_from_its_end_is_not_taken_for_a_b
 
 def test_a_thread_that_ends_across_another_one_near_its_end_does_not_turn_round_there() -> None:
     """What leads from there to the other one's end looks like a stub."""
-    scene = open_scene("clutter", 4410, "endoscope")
-    field, start = field_and_seed(scene)
-    error = curve_error(dense(initialize(field, scene.rig, start).curve), scene.truth(0)[0].points)
-    assert error.rms < 0.3
-    assert max(error.ends) < 1
+    assert_is_found_whole("clutter", 4410, "endoscope")
 
 
 def sharp_corner(rig: StereoRig, arm_px: float) -> Float64:
@@ -576,21 +581,12 @@ def test_a_thread_that_may_have_run_into_another_one_is_doubtful(
 )
 def test_a_thread_whose_end_lies_on_a_fainter_one_ends_there(seed: int, rig: str) -> None:
     """Where the two come together the other one seems to end, and behind the end it goes on."""
-    scene = open_scene("two-threads", seed, rig)
-    field, start = field_and_seed(scene)
-    found = initialize(field, scene.rig, start)
-    error = curve_error(dense(found.curve), scene.truth(0)[0].points)
-    assert error.rms < 0.3
-    assert max(error.ends) < 1
+    assert_is_found_whole("two-threads", seed, rig)
 
 
 def test_a_thread_that_goes_on_in_the_shade_is_found_whole() -> None:
     """It is far fainter there, as a vein is; but it has its colour, and is darker."""
-    scene = open_scene("clutter", 4415, "endoscope")
-    field, start = field_and_seed(scene)
-    error = curve_error(dense(initialize(field, scene.rig, start).curve), scene.truth(0)[0].points)
-    assert error.rms < 0.3
-    assert max(error.ends) < 1
+    assert_is_found_whole("clutter", 4415, "endoscope")
 
 
 def painted(strands: list[tuple[Float64, tuple[int, int, int]]], rig: StereoRig) -> RidgeField:

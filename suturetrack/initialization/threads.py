@@ -266,7 +266,7 @@ def _stops_at(
     if stop < len(pixels) or ridges.tints is None:
         is_fall = stop == stops[0]
         is_shaded = is_fall and _goes_on_in_the_shade(ridges, pixels[:stop], pixels[stop:])
-        return len(pixels) if is_shaded else stop, FADES
+        return (len(pixels) if is_shaded else stop), FADES
     return another_begins(ridges.tints.along(pixels), first), RECOLOURED
 
 
@@ -321,9 +321,11 @@ def _without_faint_ends(
             last, rest = entries[-1], entries[:-1]
             sizes = [len(segments[e // 2]) for e in rest]
             level = np.average([strength[e] for e in rest], weights=sizes)
-            parts = [np.concatenate([inward(segments, e) for e in part]) for part in (rest, [last])]
-            is_faint = strength[last] <= _FAINT * level
-            is_faint = is_faint and not _goes_on_in_the_shade(ridges, *parts)
+            is_faint = strength[last] <= _FAINT * level and not _goes_on_in_the_shade(
+                ridges,
+                np.concatenate([inward(segments, e) for e in rest]),
+                inward(segments, last),
+            )
             is_short = len(segments[last // 2]) < _SPECK
             if not (is_faint or (is_short and is_beyond_gap(joints, last ^ leaves, ridges))):
                 break
