@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from suturetrack.initialization.colours import Tints
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.kernels import crest, search
+from suturetrack.kernels.widths import moments
 from suturetrack.polylines import nearest_index, polyline_tangents, unit
 from suturetrack.types import Colours, Float32, Float64, Int64
 
@@ -37,6 +38,7 @@ _WIDTH_REACH = 40
 """Points of a segment, on each side of the seed, whose width counts."""
 _STEP_ACROSS = 0.5
 _ACROSS = np.arange(-12.0, 12.01, _STEP_ACROSS)
+_ACROSS_RIDGE = np.arange(-4.0, 4.01, _STEP_ACROSS)
 _NARROW_PX = 1.4
 """How far from its crest the ridge of a narrow thread is half as high, px."""
 _NOISE_QUANTILE = 0.9
@@ -65,6 +67,13 @@ class Ridges:
     def sample(self, pixels: Float64) -> Float64:
         """(k,) ||V|| at (k, 2) pixels, bilinear, 0 outside."""
         return _bilinear(self.magnitude, pixels)
+
+    def width(self, pixels: Float64) -> float:
+        """Squared width of the ridge along (k, 2) pixels in order, px^2, in the median."""
+        profiles = search.normal_profiles(
+            self.field, pixels, polyline_tangents(pixels), _ACROSS_RIDGE, 0.0
+        )
+        return float(np.median(moments(profiles, np.tile(_ACROSS_RIDGE, (len(pixels), 1)))[1]))
 
 
 def find_ridges(

@@ -19,6 +19,8 @@ from suturetrack.polylines import unit
 
 _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""
+_LONG_PX, _WIDER = 100, 1.1
+"""Length from which such a segment has to be wider than those of the view are, and by how much, squared."""
 _CLEARLY = 0.03
 """By how much less two strands have to cost in all if their far parts are swapped."""
 _BENT = 8.0
@@ -59,7 +61,7 @@ def _merge(ridges: Ridges, merges: Merges, arms: Arms | None, free_end: float = 
     joints.exchange()
     if arms is not None:
         _uncross(joints, arms)
-    _share(joints, arms)
+    _share(joints, ridges, arms)
     joints.open_rings()
     double_stubs(joints)
     joints.join_free(merges.pairs[order[merges.touching[order]]])
@@ -137,7 +139,7 @@ def _uncross(joints: Joints, arms: Arms) -> None:
                 break
 
 
-def _share(joints: Joints, arms: Arms | None) -> None:
+def _share(joints: Joints, ridges: Ridges, arms: Arms | None) -> None:
     """Doubles the runs of segments that a second strand waits for at both ends."""
     partner = joints.partner
     waiting: dict[int, tuple[float, int]] = {}
@@ -150,10 +152,19 @@ def _share(joints: Joints, arms: Arms | None) -> None:
         one, other = waiting[run[0]][1], waiting[run[-1] ^ 1][1]
         if one == other or one in partner or other in partner:
             continue
-        if any(e // 2 in taken for e in run):
+        if any(e // 2 in taken for e in run) or _is_of_one(joints, run, ridges):
             continue
         taken.update(e // 2 for e in run)
         _double(joints, run, one, other, arms)
+
+
+def _is_of_one(joints: Joints, run: list[int], ridges: Ridges) -> bool:
+    """Whether some of a run is too long to be that narrow, if two strands shared it."""
+    long = [s for s in (joints.segments[end // 2] for end in run) if len(s) >= _LONG_PX]
+    if not long:
+        return False
+    usual = np.median([ridges.width(s) for s in ridges.segments if len(s) >= ARM])
+    return any(ridges.width(segment) < _WIDER * usual for segment in long)
 
 
 def _runs(waiting: dict[int, tuple[float, int]], partner: dict[int, int]) -> list[list[int]]:
