@@ -68,8 +68,8 @@ class Ridges:
         """(k,) ||V|| at (k, 2) pixels, bilinear, 0 outside."""
         return _bilinear(self.magnitude, pixels)
 
-    def width(self, pixels: Float64) -> float:
-        """Squared width of the ridge along (k, 2) pixels in order, px^2, in the median."""
+    def squared_width(self, pixels: Float64) -> float:
+        """Of the ridge along (k, 2) pixels in order, px^2, in the median."""
         profiles = search.normal_profiles(
             self.field, pixels, polyline_tangents(pixels), _ACROSS_RIDGE, 0.0
         )

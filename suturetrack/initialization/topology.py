@@ -163,8 +163,8 @@ def _is_of_one(joints: Joints, run: list[int], ridges: Ridges) -> bool:
     long = [s for s in (joints.segments[end // 2] for end in run) if len(s) >= _LONG_PX]
     if not long:
         return False
-    usual = np.median([ridges.width(s) for s in ridges.segments if len(s) >= ARM])
-    return any(ridges.width(segment) < _WIDER * usual for segment in long)
+    usual = np.median([ridges.squared_width(s) for s in ridges.segments if len(s) >= ARM])
+    return any(ridges.squared_width(segment) < _WIDER * usual for segment in long)
 
 
 def _runs(waiting: dict[int, tuple[float, int]], partner: dict[int, int]) -> list[list[int]]:
