@@ -40,9 +40,10 @@ def test_the_longer_vectors_of_half_the_size_are_their_literal_twins(size: tuple
     half = rng.normal(0, 0.3, ((height + 1) // 2, (width + 1) // 2, 2)).astype(np.float32)
     field = rng.normal(0, 0.1, (height, width, 2)).astype(np.float32)
     mask = (rng.random(size) < 0.7).astype(np.uint8)
+    dark = (rng.random(half.shape[:2]) < 0.2).astype(np.uint8)
     before, asked = field.copy(), np.count_nonzero(mask)
-    twin, left = reference.keep_longer_of_half(half, mask, 0.2, field)
-    smears.keep_longer_of_half(half, mask, 0.2, field)
+    twin, left = reference.keep_longer_of_half(half, dark, (0.24, 0.36), mask, field)
+    smears.keep_longer_of_half(half, dark, (0.24, 0.36), mask, field)
     np.testing.assert_allclose(field, twin, atol=1e-5)
     np.testing.assert_array_equal(mask, left)
     assert 0 < np.count_nonzero((field != before).any(-1)) < np.count_nonzero(left) < asked
@@ -221,6 +222,36 @@ def test_a_thread_at_rest_is_seen_as_before() -> None:
     plain, told = (fields(scene, 60, told) for told in (False, True))
     np.testing.assert_array_equal(plain.left, told.left)
     np.testing.assert_array_equal(plain.right, told.right)
+
+
+def band_at(u: float, frame: int, width: float, halo: float, smear: int) -> StereoFrame:
+    """A dark band straight down both images through `line(u)`, `halo` of whose depth reaches to 4.5 px from
+    its middle, as shadows do, smeared by so many px."""
+    rig, images = make_rig(), list[Image]()
+    for pixels in rig.project(line(u)):
+        beside = abs(np.arange(rig.image_size[0]) - pixels[0, 0])
+        cover = (np.clip(half + 0.5 - beside, 0, 1) for half in (width / 2, 4.5))
+        depth = np.maximum(*(share * c for share, c in zip((1, halo), cover, strict=True)))
+        row = np.rint(160 - 100 * np.convolve(depth, np.ones(smear) / smear, "same"))
+        images.append(np.tile(row.astype(np.uint8), (rig.image_size[1], 1)))
+    return StereoFrame(Stamp(frame, frame * FRAME_NS, 0), images[0], images[1])
+
+
+@pytest.mark.parametrize("width", [2.0, 3.0, 4.0, 5.0])
+@pytest.mark.parametrize("halo", [0.0, 0.15, 0.3])
+@pytest.mark.parametrize("smear", [7, 9, 11])
+def test_a_smear_shows_in_its_middle(width: float, halo: float, smear: int) -> None:
+    """However wide the thread and the shadow beside it are."""
+    segmenter, rows = Segmenter(make_rig()), slice(150, 250)
+    for frame, u in enumerate(np.arange(180.0, 500.0, 2 * smear)):
+        images = band_at(u, frame, width, halo, smear if frame else 1)
+        if frame == 0:
+            segmenter.learn(images, Seed(pixel=(u, 200.0)))
+        field = segmenter.step(images)
+        segmenter.follow(frame * FRAME_NS, line(u))
+    across = np.linalg.norm(field.left[rows], axis=2).mean(axis=0)
+    assert across.max() > 0.05
+    assert abs(across.argmax() - u) <= 1
 
 
 @pytest.mark.parametrize("width", [8, 10])

@@ -11,25 +11,36 @@ from suturetrack.kernels import FAST
 from suturetrack.types import Float32, Image
 
 _zero, _half, _one = np.float32(0), np.float32(0.5), np.float32(1)
-# Shares of the longest vector of a smear from which a vector fades and at which it is gone.
-_FADES, _GONE = 1.2, 1.8
 
 
 @njit(cache=True, **FAST)
-def keep_longer_of_half(half: Float32, mask: Image, longest: float, out: Float32) -> None:
+def find_longer_than(longest: float, vectors: Float32, found: Image) -> None:
+    """Sets (H, W) `found` to 1 where (H, W, 2) vectors are longer than that, elsewhere to 0."""
+    least = np.float32(longest * longest)
+    for y in range(len(vectors)):
+        for x in range(vectors.shape[1]):
+            u, v = vectors[y, x, 0], vectors[y, x, 1]
+            found[y, x] = u * u + v * v > least
+
+
+@njit(cache=True, **FAST)
+def keep_longer_of_half(
+    half: Float32, dark: Image, bounds: tuple[float, float], mask: Image, out: Float32
+) -> None:
     """Within the mask, the longer of both fields' vectors into `out`.
 
     Args:
         half: (ceil(H / 2), ceil(W / 2), 2), read linearly between the vectors' places; their signs mean
             nothing.
-        mask: (H, W), 0 where `out` stays as it is; set to 0 where something is too dark for a smear.
-        longest: length of the longest vector in `half` that a smeared thread has; longer ones fade, and
-            what is much longer is something darker, such as a tool.
+        dark: (ceil(H / 2), ceil(W / 2)), not 0 where something is too dark for a smear.
+        bounds: lengths from which vectors in `half` fade and at which they are gone: of a smear there are
+            hardly any so long.
+        mask: (H, W), 0 where `out` stays as it is; set to 0 where something is too dark.
         out: (H, W, 2), overwritten.
     """
     height, width = out.shape[:2]
     rows, columns = half.shape[:2]
-    gone, fading = np.float32(_GONE * longest), np.float32((_GONE - _FADES) * longest)
+    gone, fading = np.float32(bounds[1]), np.float32(bounds[1] - bounds[0])
     for y in range(height):
         v = (np.float32(y) + _half) * np.float32(rows / height) - _half
         top = math.floor(v)
@@ -42,7 +53,11 @@ def keep_longer_of_half(half: Float32, mask: Image, longest: float, out: Float32
             before = math.floor(u)
             right = u - np.float32(before)
             left, after = max(before, 0), min(before + 1, columns - 1)
-            nearest = half[above if down < _half else below, left if right < _half else after]
+            row, column = above if down < _half else below, left if right < _half else after
+            if dark[row, column]:
+                mask[y, x] = 0
+                continue
+            nearest = half[row, column]
             p = q = _zero
             for row, by_row in ((above, _one - down), (below, down)):
                 for column, by_column in ((left, _one - right), (after, right)):
@@ -51,9 +66,6 @@ def keep_longer_of_half(half: Float32, mask: Image, longest: float, out: Float32
                         share = -share
                     p, q = p + share * vector[0], q + share * vector[1]
             length = np.sqrt(p * p + q * q)
-            if length > gone:
-                mask[y, x] = 0
-                continue
             kept = min(max((gone - length) / fading, _zero), _one)
             p, q = kept * p, kept * q
             if p * p + q * q > out[y, x, 0] * out[y, x, 0] + out[y, x, 1] * out[y, x, 1]:

@@ -23,6 +23,7 @@ import numpy as np
 
 from suturetrack.kernels.ridge import gaussian_taps
 from suturetrack.polylines import unit
+from suturetrack.segmentation.smear import SCALES
 from suturetrack.types import Float64, Image, Int64
 
 SIGMAS = (1.2, 2.4, 4.8, 9.6)
@@ -85,6 +86,8 @@ class Contrast:
     """(3, 3) covariance of the second derivatives around the thread."""
     sigma: float
     """Scale that suits the thread's width, px."""
+    wider: tuple[float, ...] = (0.4, 0.73)
+    """What of `across` each of the SCALES for smears shows; of a bare band, two sigmas wide, unless seen."""
 
     @property
     def strength(self) -> float:
@@ -109,7 +112,8 @@ class Contrast:
 
         weights = between(self.weights, seen.weights)
         across, clutter = between(self.across, seen.across), between(self.clutter, seen.clutter)
-        return Contrast(weights / np.abs(weights).sum(), across, clutter, self.sigma)
+        weights = weights / np.abs(weights).sum()
+        return replace(self, weights=weights, across=across, clutter=clutter)
 
     def fainter(self, share: float, clear: Contrast) -> Contrast:
         """As if it stood out by a `share` only, or by a quarter of what was `clear`, if that is more."""
@@ -150,7 +154,17 @@ def contrast_at(image: Image, pixel: Float64) -> Contrast | None:
     ridge = _Ridge(zoom * best.ridge.pixels + seed, best.ridge.normals)
     across = _of_one_thread(scene, ridge, seed)
     clutter = scene.clutter_near(seed, zoom * _NEAR_PX)
-    return _contrast(clutter, across, sigma * 2**octave, image)
+    contrast = _contrast(clutter, across, sigma * 2**octave, image)
+    return replace(contrast, wider=tuple(_shown_at(s.times, crop, ridge, scene) for s in SCALES))
+
+
+def _shown_at(times: int, image: Image, ridge: _Ridge, scene: _Scene) -> float:
+    """How much of a ridge in a scene of the image a scale shows that is so many times wider."""
+    own, wide = (
+        np.median(ridge.across(seen), axis=0)
+        for seen in (scene, _Scene.of(image, times * scene.sigma))
+    )
+    return float(wide @ own / (own @ own))
 
 
 def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:

@@ -210,7 +210,8 @@ class Segmenter:
             field = sight.step(frame, 0)
             ridge.keep_longer(field[0], field[1])
             self._colouring.of(frame, *field)
-        smears.keep_longer_of_half(field[0], black, 1.0, field[1])
+        smears.find_longer_than(1.0, field[0], black)
+        smears.keep_longer_of_half(field[0], black, (1.0, 2.0), black, field[1])
 
     def _seen(self, frame: StereoFrame) -> StereoFrame:
         return silhouettes(frame) if self._is_cut_out else frame

@@ -12,7 +12,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.kernels import ridge, rims, smears
 from suturetrack.segmentation.config import SegmentationConfig
 from suturetrack.segmentation.contrast import GRAY, SIGMAS, Contrast, channel_means
-from suturetrack.segmentation.smear import WIDER, Band
+from suturetrack.segmentation.smear import SCALES, Band
 from suturetrack.types import Float32, Float64, Image, StereoFrame
 
 Pair = tuple[Float32, Float32]
@@ -33,6 +33,8 @@ _PULL = 0.1
 _GROUND = 2.5
 # How far around it a vector depends on the image, in sigmas.
 _AROUND = 8.0
+# How far beside something a filter still sees it, in sigmas.
+_FLANK = 1.0
 # Least automatic c, grey levels: what a flawless picture's rounding makes.
 _LEAST_C = 1.0
 
@@ -50,6 +52,8 @@ class Look:
     """See `ridge.ridge_field`."""
     across: Float64 | None = None
     """(3,) of `Contrast.across`; None until a thread is learned."""
+    wider: tuple[float, ...] = ()
+    """Of `Contrast.wider`."""
 
     def mix(self, means: Float64) -> tuple[Float32, float | None]:
         """The weights for an image with such means, and c, if it was learned.
@@ -75,11 +79,11 @@ def learned_look(config: SegmentationConfig, thread: Contrast) -> Look:
     signs, sigmas = _SIGNS[config.polarity], config.sigmas or (thread.sigma,)
     if config.channel == "learned":
         weights = -thread.weights if config.polarity == "bright" else thread.weights
-        return Look(weights, True, sigmas, signs, thread.across)
+        return Look(weights, True, sigmas, signs, thread.across, thread.wider)
     weights = _WEIGHTS[config.channel]
     if config.polarity == "auto" and thread.across @ weights < 0:
         signs = _SIGNS["bright"]
-    return Look(weights, False, sigmas, signs, thread.across)
+    return Look(weights, False, sigmas, signs, thread.across, thread.wider)
 
 
 class Sight:
@@ -182,6 +186,7 @@ class _Smears:
         self._filter = _Filter((height, width), config.beta, config.blur / 2)
         self._plane = np.empty((height, width), np.float32)
         self._field = np.empty((height, width, 2), np.float32)
+        self._dark = np.empty((height, width), np.uint8)
         self._mask = np.empty(size, np.uint8)
 
     def add(self, plane: Float32, look: Look, c: float, band: Band, field: Float32) -> None:
@@ -195,12 +200,17 @@ class _Smears:
             return
         size = self._plane.shape[::-1]
         cv2.resize(plane, size, dst=self._plane, interpolation=cv2.INTER_AREA)
-        for scale in WIDER:
+        for scale, wider in zip(SCALES, look.wider, strict=True):
             times = scale.times / 2
-            around = round(_AROUND * times * max(look.sigmas))
+            around, flank = (round(k * times * max(look.sigmas)) for k in (_AROUND, _FLANK))
             rows = slice(max(painted[0] - around, 0), painted[-1] + around)
             self._filter.find_ridges(self._plane[rows], look, c, self._field[rows], times)
-            smears.keep_longer_of_half(self._field, self._mask, scale.longest, field)
+            bounds = scale.bounds(wider)
+            smears.find_longer_than(bounds[1], self._field[rows], self._dark[rows])
+            # The flanks of what is too dark are none either.
+            beside = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * flank + 1,) * 2)
+            cv2.dilate(self._dark[rows], beside, dst=self._dark[rows])
+            smears.keep_longer_of_half(self._field, self._dark, bounds, self._mask, field)
 
 
 def gaussian_kernel(sigma: float) -> Float32:

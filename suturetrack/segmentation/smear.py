@@ -25,6 +25,8 @@ _STEPS, _BESIDE_PX, _FURTHEST_PX = 2.0, 6.0, 40.0
 # And how many of its steps beyond its ends, where it may be held by something dark.
 _BEYOND = 1.5
 _PLACES_ACROSS = np.linspace(-1, 1, 61)
+# So much darker than a smear something surely is none.
+_DARKER = 1.3
 # Vectors shorter than this along the thread show nothing.
 _FAINT = 0.2
 
@@ -35,12 +37,22 @@ class Scale:
 
     times: int
     """How much wider."""
-    longest: float
-    """Length of a smear's vectors, at most: the wider a smear, the fainter. This is what is left of a thread
-    as wide as two sigmas, whose S is 2c, when this scale begins to see it better than half of it does."""
+    left: float
+    """Of what it shows of the thread at rest, what it shows of a smear that its own scale does not, at most:
+    of bands of 1.5 to 3.5 sigmas, smeared evenly."""
+
+    def bounds(self, wider: float) -> tuple[float, float]:
+        """Lengths from which a vector is too long for a smear, and at which it is none for sure.
+
+        Args:
+            wider: what of the thread at rest, whose S is 2c at its own scale, this one shows.
+        """
+        smeared = 2 * wider * self.left * np.array([1.0, _DARKER])
+        longest, gone = 1 - np.exp(-(smeared**2) / 2)
+        return float(longest), float(gone)
 
 
-WIDER = Scale(4, 0.193), Scale(2, 0.576)
+SCALES = Scale(4, 0.9), Scale(2, 0.67)
 """The widest first: what is too dark there for a smear is none on the others either."""
 
 

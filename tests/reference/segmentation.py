@@ -134,23 +134,25 @@ def longer_than(least, vectors):
     return np.stack([u, v], axis=1)
 
 
-def keep_longer_of_half(half, mask, longest, field, fades_from=1.2, gone_at=1.8):
+def keep_longer_of_half(half, dark, bounds, mask, field):
     """The field with the longer vectors of one of half the size, where the mask says so, and the mask."""
     out, left = field.copy(), mask.copy()
+    fades_from, gone_at = bounds
     (height, width), (rows, columns) = mask.shape, half.shape[:2]
     for y, x in np.argwhere(mask):
         v = np.clip((y + 0.5) * rows / height - 0.5, 0, rows - 1)
         u = np.clip((x + 0.5) * columns / width - 0.5, 0, columns - 1)
         row, column = np.arange(rows), np.arange(columns)
         share = np.outer(np.maximum(1 - abs(row - v), 0), np.maximum(1 - abs(column - u), 0))
-        nearest = half[np.unravel_index(share.argmax(), share.shape)]
+        place = np.unravel_index(share.argmax(), share.shape)
+        if dark[place]:
+            left[y, x] = 0
+            continue
+        nearest = half[place]
         signed = half * np.where(half @ nearest < 0, -1, 1)[..., None]
         vector = (share[..., None] * signed).sum((0, 1))
         length = np.linalg.norm(vector)
-        vector = vector * np.clip(
-            (gone_at * longest - length) / ((gone_at - fades_from) * longest), 0, 1
-        )
-        left[y, x] = length <= gone_at * longest
+        vector = vector * np.clip((gone_at - length) / (gone_at - fades_from), 0, 1)
         if np.linalg.norm(vector) > np.linalg.norm(field[y, x]):
             out[y, x] = vector
     return out, left
