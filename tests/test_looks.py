@@ -628,6 +628,15 @@ def test_one_sure_look_is_enough_where_the_thread_was_found_again_by_its_length(
     assert sureness.is_sure == (is_known and not is_revoked)
 
 
+def test_a_sure_look_that_finds_another_length_needs_another(rig: StereoRig) -> None:
+    """However long what was found again by its length is followed."""
+    truth = thread(0.0)
+    known, longer = look_at(rig, truth[: -len(truth) // 10], 0.4), look_at(rig, truth, 0.7)
+    sureness = Sureness(known, known.curve, 0, rig, is_known=True)
+    sureness.weigh(longer, known.curve)
+    assert not sureness.is_sure
+
+
 @pytest.mark.parametrize("is_accused", [False, True])
 def test_what_runs_beside_a_revoked_curve_takes_its_place(rig: StereoRig, is_accused: bool) -> None:
     first = look_at(rig, thread(0.0), 0.9 if is_accused else 0.1)

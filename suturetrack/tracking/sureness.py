@@ -8,6 +8,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, PlacedDoubts, remaining
 from suturetrack.nurbs import evaluate
 from suturetrack.polylines import nearest_index, polyline_distances, resample
+from suturetrack.tracking.length import has_length
 from suturetrack.tracking.sampling import length_of
 from suturetrack.types import Float64, Nurbs
 
@@ -58,7 +59,8 @@ class Sureness:
         now_ns: capture time of the field.
         rig: the cameras.
         before: how sure it was of what was followed before.
-        is_known: whether it has the length of a thread that was sure: any sure look is enough then.
+        is_known: whether it has the length of a thread that was sure: any sure look that finds it so long
+            is enough then.
     """
 
     def __init__(
@@ -76,8 +78,7 @@ class Sureness:
         self._accused: Float64 | None = None if before is None else before._accused
         self._is_revoked = False
         """Whether it was sure of the curve that is followed, and is no more."""
-        self._single = SURE if is_known else _SINGLE
-        """Confidence of a look that needs no other."""
+        self._known_length = length_of(found.curve) if is_known else None
         enough = SURE if is_known else _AT_ONCE
         self.is_sure = found.confidence >= enough and not self._is_accused(curve)
         """Whether the curve that is followed may be called the thread."""
@@ -103,7 +104,7 @@ class Sureness:
         """Makes what was sure open again: looks have to tell."""
         if self.is_sure:
             self._accused, self._is_revoked = self._outline(curve), True
-            self.is_sure, self._votes, self._single = False, _HOPELESS, _SINGLE
+            self.is_sure, self._votes, self._known_length = False, _HOPELESS, None
             self._length = 0.0
             self._looks, self._last_ns = 0, now_ns
 
@@ -184,7 +185,8 @@ class Sureness:
         elif votes > self._votes or found.confidence >= SURE > self.confidence:
             self._begin(found, votes)
         is_enough = self._votes >= _ENOUGH and remaining(self._doubts) >= SURE
-        self.is_sure = is_enough or found.confidence >= self._single
+        is_known = self._known_length is not None and has_length(found.curve, (self._known_length,))
+        self.is_sure = is_enough or found.confidence >= (SURE if is_known else _SINGLE)
 
     def _is_accused(self, curve: Nurbs) -> bool:
         """Whether it is a curve that was revoked, and has not moved."""
