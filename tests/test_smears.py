@@ -49,6 +49,14 @@ def test_the_longer_vectors_of_half_the_size_are_their_literal_twins(size: tuple
     assert 0 < np.count_nonzero((field != before).any(-1)) < np.count_nonzero(left) < asked
 
 
+def test_long_vectors_are_found() -> None:
+    vectors = np.random.default_rng(4).normal(0, 0.3, (7, 9, 2)).astype(np.float32)
+    found = np.full((7, 9), 7, np.uint8)
+    smears.find_longer_than(0.4, vectors, found)
+    np.testing.assert_array_equal(found, np.linalg.norm(vectors, axis=2) > 0.4)
+    assert 0 < found.mean() < 1
+
+
 def line(u: float) -> Float64:
     """A thread straight down the image, at a depth of 100."""
     rig = make_rig()
