@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pytest
 import rerun as rr
 
@@ -25,8 +26,9 @@ from services.segmenter import SegmenterConfig
 from services.service import Service, ServiceConfig
 from services.tracker import TrackerConfig
 from services.writer import Writer
+from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
-from suturetrack.stage import open_scene
+from suturetrack.stage import Scene, open_scene
 from suturetrack.types import InputError, Seed, Stamp, StereoFrame, ThreadState
 
 FRAMES = 4
@@ -35,17 +37,19 @@ FRAMES = 4
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the bench top, played once through the processes and recorded in full."""
-    folder: Path = tmp_path_factory.mktemp("runs")
-    scene = open_scene("figure8-107")
-    frames, played = folder / "frames", folder / "played"
-    with Recorder(frames, "source", "full", scene.rig) as recorder:
+    return played(tmp_path_factory.mktemp("runs"), open_scene("figure8-107"), "full")
+
+
+def played(folder: Path, scene: Scene, level: Literal["light", "full"]) -> Path:
+    """The run in `folder` of the first frames of a scene, which were recorded at a level before."""
+    with Recorder(folder / "frames", "source", level, scene.rig) as recorder:
         for i in range(FRAMES):
             stamp = Stamp(3 * i, i * 33_000_000, 0)  # two of three frames were dropped
             recorder.frame(StereoFrame(stamp, *scene.render(i)))
     u, v = scene.seed_pixel()
-    write_config(Parameters(seed=((float(u), float(v)),)), frames / "config.toml")
-    run(ReplayConfig(frames, played, recording="full"))
-    return played
+    write_config(Parameters(seed=((float(u), float(v)),)), folder / "frames" / "config.toml")
+    run(ReplayConfig(folder / "frames", folder / "played", recording="full"))
+    return folder / "played"
 
 
 def states(run_dir: Path) -> list[RecordedState]:
@@ -193,6 +197,15 @@ def test_a_changed_parameter_changes_the_states(tmp_path: Path, recorded: Path) 
     run(ReplayConfig(recorded, new, "tracker", set=("tracking.smoothing=90.0",)))
     assert bits(new) != bits(recorded)
     assert "smoothing = 90.0" in (new / "config.toml").read_text()
+
+
+def test_a_light_recording_shows_threads_where_they_were(tmp_path: Path) -> None:
+    scene = open_scene("figure8-107")
+    last = states(played(tmp_path, scene, "light"))[-1].state.curve
+    assert last is not None
+    curve = nurbs.evaluate(last, np.linspace(0, 1, 500))
+    truth = scene.truth(FRAMES - 1)[0].points
+    assert scene.rig.mm_per_unit * metrics.curve_error(curve, truth).rms < 0.12
 
 
 def test_changes_are_checked() -> None:
