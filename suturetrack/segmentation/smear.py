@@ -37,7 +37,7 @@ class Scale:
 
     times: int
     """How much wider."""
-    left: float
+    share: float
     """Of what it shows of the thread at rest, what it shows of a smear that its own scale does not, at most:
     of bands of 1.5 to 3.5 sigmas, smeared evenly."""
 
@@ -47,7 +47,7 @@ class Scale:
         Args:
             wider: what of the thread at rest, whose S is 2c at its own scale, this one shows.
         """
-        smeared = 2 * wider * self.left * np.array([1.0, _DARKER])
+        smeared = 2 * wider * self.share * np.array([1.0, _DARKER])
         longest, gone = 1 - np.exp(-(smeared**2) / 2)
         return float(longest), float(gone)
 
