@@ -81,8 +81,10 @@ class Fit:
     """The samples on the curve, left and right."""
     residual: Float64
     """(k, 2) px between the curve and what was found, left and right; nan where nothing was."""
+    noise_px: float
+    """Standard deviation that the offsets were taken to have."""
     covariance: Float64
-    """(k, 3, 3) of the samples' positions."""
+    """(k, 3, 3) of the samples' positions, by that noise."""
     crowd: Crowd
     """Where other ridges run close beside the thread."""
 
@@ -152,7 +154,8 @@ def fit(
         reach = max(reach / 2, _REFINED_PX)
     curve = curve_from(spline.DEGREE, predicted.knots, control_points)
     covariance = equations.covariance(samples)
-    return Fit(curve, samples, both, _residual(both, linear), covariance, crowd)
+    residual = _residual(both, linear)
+    return Fit(curve, samples, both, residual, config.noise_px, covariance, crowd)
 
 
 def observe(
@@ -168,7 +171,8 @@ def observe(
     reference, surprise = _Reference.of(samples, curve), linear.surprise(crowd)
     equations = linear.equations(reference, still, config, _OUTLIER_PX, crowd, surprise)
     equations.solve()
-    return Fit(curve, samples, both, _residual(both, linear), equations.covariance(samples), crowd)
+    residual, covariance = _residual(both, linear), equations.covariance(samples)
+    return Fit(curve, samples, both, residual, config.noise_px, covariance, crowd)
 
 
 def expected(

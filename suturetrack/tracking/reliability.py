@@ -32,6 +32,9 @@ _GAP = 5
 # Share that has to run alone, so that the others, which other ridges draw aside, hardly make it longer.
 _CLEARLY = 0.94
 _NOISE_SIGMAS = 3.0
+# What a fit leaves of the offsets, against their noise: it follows the rest. And so many samples it takes to
+# tell, at least.
+_LEFT_OVER, _FEWEST = 0.55, 10
 # Share of the curve that the tips are at most.
 _TIPS = 0.1
 
@@ -67,9 +70,18 @@ class Evidence:
 
     @cached_property
     def sigma(self) -> Float64:
-        """(K,) standard deviation of the position, at evenly spaced parameters."""
+        """(K,) standard deviation of the position, at evenly spaced parameters; more than the fit's where
+        it leaves more of the offsets, as of what moves fast or was compressed."""
         variance = np.trace(self.fit.covariance, axis1=1, axis2=2)
-        return np.interp(EVENLY, self.fit.samples.s, np.sqrt(variance))
+        return self._noisier * np.interp(EVENLY, self.fit.samples.s, np.sqrt(variance))
+
+    @cached_property
+    def _noisier(self) -> float:
+        """How many times the noise that the fit assumed the offsets have, at least once."""
+        left = self.fit.residual[self.seen & ~self.fit.crowd.others]
+        if len(left) < _FEWEST:
+            return 1.0
+        return max(1.0, float(np.sqrt(np.mean(left**2))) / (_LEFT_OVER * self.fit.noise_px))
 
     @cached_property
     def evenly_seen(self) -> Bool:
