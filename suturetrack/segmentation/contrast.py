@@ -5,11 +5,6 @@ a vector h, one number a channel; everywhere else they scatter with a covariance
 w = C^-1 h is Fisher's mix: in no other does the thread stand out more from texture, noise, and the
 highlights that make h itself vary along the thread. In it the thread is dark.
 
-Where a camera has compressed the colours, or halved their resolution, they are uneven along the thread, and
-draw the middle of it aside, in each view elsewhere. So the second derivatives along the thread, of which an
-even one has none, count as clutter, several times over: a mix is preferred that is even, if gray is not as
-good anyway.
-
 A highlight on wet tissue is white, and in a mix of differences, as of blue from red, may be as dark as
 the thread. Where there are some, the best of the mixes is taken in which they are not, if the thread stays
 clear in that one.
@@ -60,15 +55,13 @@ _BELOW = 0.8
 _BESIDE = (-3, -2.5, -2, -1.5, 1.5, 2, 2.5, 3)
 # A mix that is not better than gray by this factor is not worth its noise.
 _WORTH = 1.1
-# How many times what is uneven along the thread counts, beside the clutter.
-_UNEVEN = 30.0
 # A ridge found in gray that is not better than one of another mix by this factor is not taken for it.
 _BETTER = 1.04
 # What of its distinctness a thread keeps, at least, in a mix that is blind to highlights: white ones do not.
 _KEPT = 0.667
 # A highlight's second derivative is about a third of what it differs from the ground; below 0.4 of the
 # thread's, an end is seen before it.
-_FAINTER = 0.8
+_FAINTER = 1.2
 # Grey levels of a highlight in every channel, and the share of the picture below which there are none.
 _WHITE, _SCARCE = 225, 2e-4
 # Along a curve: how many windows are looked at, and half their width.
@@ -161,7 +154,7 @@ def contrast_at(image: Image, pixel: Float64) -> Contrast | None:
     ridge = _Ridge(zoom * best.ridge.pixels + seed, best.ridge.normals)
     across = _of_one_thread(scene, ridge, seed)
     clutter = scene.clutter_near(seed, zoom * _NEAR_PX)
-    contrast = _contrast(clutter, across, ridge.along(scene), sigma * 2**octave, image)
+    contrast = _contrast(clutter, across, sigma * 2**octave, image)
     return replace(contrast, wider=tuple(_shown_at(s.times, crop, ridge, scene) for s in SCALES))
 
 
@@ -183,7 +176,7 @@ def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
         sigma: scale that suits the thread's width, px.
     """
     normals = unit(np.gradient(pixels, axis=0))[:, ::-1] * (-1, 1)
-    across, along, clutter = [], [], []
+    across, clutter = [], []
     for i in np.linspace(0, len(pixels) - 1, min(_WINDOWS, len(pixels))).round().astype(int):
         crop, centre = _window(image, pixels[i], _HALF_PX)
         scene = _Scene.of(crop, sigma)
@@ -191,10 +184,9 @@ def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
         near = np.abs(pixels - pixels[i]).max(1) <= _HALF_PX - 3 * sigma
         ridge = _Ridge(pixels[near] - pixels[i] + centre, normals[near])
         across.append(ridge.across(scene))
-        along.append(ridge.along(scene))
         clutter.append(scene.clutter)
-    around = np.mean(clutter, axis=0)
-    return _contrast(around, np.concatenate(across), np.concatenate(along), sigma, image)
+    middle = np.concatenate(across)
+    return _contrast(np.mean(clutter, axis=0), middle, sigma, image)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,22 +278,12 @@ class _Ridge:
 
     def across(self, scene: _Scene, offset: float = 0.0) -> Float64:
         """(N, channels) second derivative along the normal, `offset` px beside the middle."""
-        return self._second(scene, offset, self.normals)
-
-    def along(self, scene: _Scene) -> Float64:
-        """(3 N, channels) second derivative along the ridge, in the middle and a pixel to either side."""
-        tangents = self.normals[:, ::-1] * (-1, 1)
-        return np.concatenate(
-            [self._second(scene, offset, tangents) for offset in (-1.0, 0.0, 1.0)]
-        )
-
-    def _second(self, scene: _Scene, offset: float, directions: Float64) -> Float64:
         height, width = scene.hessian.shape[1:3]
         at = np.rint(self.pixels + offset * self.normals).astype(int)
         u, v = np.clip(at, 0, (width - 1, height - 1)).T
         uu, uv, vv = scene.hessian[:, v, u]
-        du, dv = directions[:, :1], directions[:, 1:]
-        return du * du * uu + 2 * du * dv * uv + dv * dv * vv
+        nu, nv = self.normals[:, :1], self.normals[:, 1:]
+        return nu * nu * uu + 2 * nu * nv * uv + nv * nv * vv
 
 
 def _scatter(hessian: Float64) -> Float64:
@@ -433,11 +415,8 @@ def _of_one_thread(scene: _Scene, ridge: _Ridge, seed: Float64) -> Float64:
     return across[alike] if np.count_nonzero(alike) >= _SHORTEST_PX else across
 
 
-def _contrast(
-    clutter: Float64, across: Float64, along: Float64, sigma: float, image: Image
-) -> Contrast:
-    """From the (channels, channels) clutter, and (N, channels) derivatives across and along the thread, grey
-    levels."""
+def _contrast(clutter: Float64, across: Float64, sigma: float, image: Image) -> Contrast:
+    """From the (channels, channels) clutter and (N, channels) derivatives across, grey levels."""
     means = channel_means(image)
     middle, weights = np.median(across, axis=0), _fisher(clutter, across)
     if len(weights) == 1:
@@ -447,13 +426,11 @@ def _contrast(
         total = clutter + np.cov(across.T)
         gray = GRAY * np.sign(middle @ GRAY)
         shown = [middle @ w / math.sqrt(w @ total @ w) for w in (weights, gray)]
-        shadow = np.outer(_SHADOW * means, _SHADOW * means)
-        uneven = _UNEVEN * along.T @ along / len(along)
-        is_gray = shown[0] < _WORTH * shown[1]
-        weights = gray if is_gray else _fisher(clutter + shadow + uneven, across)
-        highlight = _highlight(image, means)
+        if shown[0] < _WORTH * shown[1]:
+            weights = gray
+        highlight, shadow = _highlight(image, means), _SHADOW * means
         if highlight is not None:
-            nuisance = total + shadow + uneven
+            nuisance = total + np.outer(shadow, shadow)
             weights = _without_highlights(weights, middle, nuisance, highlight)
     weights = weights * means
     clutter = clutter / np.outer(means, means)
