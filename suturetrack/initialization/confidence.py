@@ -64,6 +64,14 @@ _ALONE = 4.0
 """How many times better the odds are that a thread that is alone goes on as it was found to: another way
 would leave a part of it to nobody. Of 171 such starts, 169 were right and as many in order, however much
 was in doubt."""
+_SAME_WAY = 0.3
+"""Cosine of the angle between two passes of a thread from which both run the same way."""
+_JUMP, _JUMP_PX, _JUMP_REACH = 2.0, 0.14, 8
+"""How many times as sharply as anywhere across a curve bends in depth, and how sharply, 1/px as seen from the
+side, over so many pixels, where the views have taken strands for each other: of 828 starts seven of the 64
+wrong ones, and no right one."""
+_JUMPED, _SMOOTH = 0.3, 0.5
+"""What that leaves of the confidence, and the share of such a jump up to which a curve is smooth."""
 _SHARP_REST = 0.5
 """What is left of the confidence at a sharp bend, at least, where no other ridge is near."""
 _SHARP_COSINE = 0.5
@@ -103,12 +111,17 @@ def judge(
         rig: the cameras.
         scale: what makes the pixels of all these those of the whole image.
     """
-    pixels = rig.project(nurbs.evaluate(curve, np.linspace(0, 1, 32 * len(curve.control_points))))
+    points = nurbs.evaluate(curve, np.linspace(0, 1, 32 * len(curve.control_points)))
+    pixels = rig.project(points)
     agreement = min(_agreement(p, c.pixels, rig) for p, c in zip(pixels, chains, strict=True))
     confidence, reasons = _of_the_whole(agreement, samples, sigma, nurbs.length(curve))
     others = max(_others(line, r) for line, r in zip(pixels, ridges, strict=True))
     is_alone = others <= _NEXT_TO_NOTHING
-    doubts = _left_in_doubt(pixels, chains, ridges, is_alone=is_alone)
+    jump = _jump_in_depth(points, pixels[0], rig.left.projection[0, 0])
+    if jump >= 1:
+        confidence *= _JUMPED
+        reasons.append("a jump in depth, as where the views take strands for each other")
+    doubts = _left_in_doubt(pixels, chains, ridges, is_alone=is_alone, is_smooth=jump < _SMOOTH)
     reasons += _in_words(doubts, rig, scale)
     further = [
         _ends_further_on(p, c.pixels, r) for p, c, r in zip(pixels, chains, ridges, strict=True)
@@ -149,10 +162,14 @@ def _left_in_doubt(
     ridges: tuple[Ridges, Ridges],
     *,
     is_alone: bool,
+    is_smooth: bool,
 ) -> list[list[Doubt]]:
-    """What each view still doubts once the whole curve is known; `lines` are the curve in both views."""
+    """What each view still doubts once the whole curve is known; `lines` are the curve in both views, and
+    `is_smooth` tells whether it is in depth as well."""
     doubts = [_settled(_distinct(c), p, r) for c, p, r in zip(chains, lines, ridges, strict=True)]
     doubts = [_confirmed(view, doubts, lines) for view in (0, 1)]
+    if is_smooth:
+        doubts = [_without_loops(d, p) for d, p in zip(doubts, lines, strict=True)]
     if not is_alone:
         return doubts
     return [[_of_itself(d, p) for d in of_view] for of_view, p in zip(doubts, lines, strict=True)]
@@ -298,6 +315,47 @@ def _of_itself(doubt: Doubt, line: Float64) -> Doubt:
     if not is_bent and doubt.why not in (CROSSING, SHARED):
         return doubt
     return doubt._replace(rest=_ALONE * doubt.rest / (_ALONE * doubt.rest + 1 - doubt.rest))
+
+
+def _without_loops(doubts: list[Doubt], line: Float64) -> list[Doubt]:
+    """The doubts without those of places that the curve, (k, 2) pixels, passes twice the same way.
+
+    Another way there would leave a closed loop, which no thread is, unless that changed with another strand.
+    """
+    passes = [_passes(doubt, line) for doubt in doubts]
+    single = [of_doubt[0][0] for of_doubt in passes if len(of_doubt) == 1]
+    kept = []
+    for doubt, of_doubt in zip(doubts, passes, strict=True):
+        is_loop = doubt.why in (CROSSING, SHARED, BENT) and _run_the_same_way(of_doubt, line)
+        if not is_loop or any(of_doubt[0][0] < at < of_doubt[1][-1] for at in single):
+            kept.append(doubt)
+    return kept
+
+
+def _passes(doubt: Doubt, line: Float64) -> list[Int64]:
+    """Which points of the curve, (k, 2) pixels, are near the place of a doubt, each time that it passes."""
+    near = _near(doubt, line)
+    return np.split(near, np.flatnonzero(np.diff(near) > 1) + 1) if len(near) else []
+
+
+def _run_the_same_way(passes: list[Int64], line: Float64) -> bool:
+    """Whether there are two passes of the curve, (k, 2) pixels, that run the same way."""
+    if len(passes) != 2:
+        return False
+    one, two = (unit(line[near[-1]] - line[near[0]]) for near in passes)
+    return bool(one @ two > _SAME_WAY)
+
+
+def _jump_in_depth(points: Float64, line: Float64, focal: float) -> float:
+    """How much a curve of (k, 3) points, (k, 2) pixels, bends in depth, against one that jumps there."""
+    s = arc_lengths(line)
+    even: Float64 = np.arange(0.0, s[-1], 1.0)
+    depth = focal * np.log(np.maximum(np.interp(even, s, points[:, 2]), 1e-9))
+    seen, h = np.c_[polyline_at(line, even), depth], _JUMP_REACH
+    bends = seen[2 * h :] - 2 * seen[h:-h] + seen[: -2 * h]
+    across = float(np.linalg.norm(bends[:, :2], axis=1).max(initial=1e-9))
+    towards = float(np.abs(bends[:, 2]).max(initial=0.0))
+    return min(towards / (_JUMP * across), towards / (_JUMP_PX * h**2))
 
 
 def _near(doubt: Doubt, line: Float64) -> Int64:

@@ -58,7 +58,7 @@ _PARALLEL = 0.7
 """Cosine of the angle up to which a strand that ends on the thread runs into it."""
 _JOINS_PX = 8.0
 """How near to it such a strand ends: the thread draws its last points aside."""
-_CLEAR, _LEAVES_PX = 0.4, 15.0
+_CLEAR, _LEAVES_PX = 0.4, 10.0
 """Strength of a strand at the thread's side or end, against the thread there, and how far away it leads, at
 least: another thread may have another colour, and a shadow has a quarter of the strength."""
 _SIDE, _AT = 40, 4
