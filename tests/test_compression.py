@@ -1,4 +1,4 @@
-"""Pictures that a camera has compressed: how exact curves are said to be."""
+"""How exact curves are said to be: of pictures that a camera has compressed, and of knots."""
 
 from __future__ import annotations
 
@@ -49,3 +49,13 @@ def test_the_stated_deviation_is_that_of_the_curve(
         inner = state.seen & (abs(np.linspace(-1, 1, len(away))) < 0.9)
         ratios.append(np.sqrt(np.mean((away / state.sigma)[inner] ** 2)))
     assert 0.15 < np.median(ratios) < 1.0
+
+
+@pytest.mark.parametrize("number", [5241, 5242])
+def test_strands_of_a_knot_that_draw_each_other_aside_are_no_noise(number: int) -> None:
+    scene = open_scene("knot", number, "endoscope")
+    segmenter, tracker = learned(scene), Tracker(scene.rig, TrackingConfig())
+    tracker.seed(Seed(scene.threads[0], pixel=scene.seed_pixel()))
+    (state,) = tracker.step(segmenter.step(frame(scene, 0))).states
+    assert state.status is Status.TRACKING
+    assert np.sqrt(np.mean(state.sigma**2)) * scene.rig.mm_per_unit < 1.0

@@ -78,7 +78,8 @@ class Evidence:
     @cached_property
     def _noisier(self) -> float:
         """How many times the noise that the fit assumed the offsets have, at least once."""
-        left = self.fit.residual[self.seen & ~self.fit.crowd.others]
+        crowd = self.fit.crowd
+        left = self.fit.residual[self.seen & ~(crowd.others | crowd.itself)]
         if len(left) < _FEWEST:
             return 1.0
         return max(1.0, float(np.sqrt(np.mean(left**2))) / (_LEFT_OVER * self.fit.noise_px))
