@@ -532,8 +532,8 @@ def test_a_way_that_would_leave_a_closed_loop_makes_nothing_doubtful(
 @pytest.mark.parametrize(
     ("scenario", "seed"), [("fast", 5008), ("two-threads", 5221), ("knot", 5210), ("knot", 5014)]
 )
-def test_strands_that_the_views_take_for_each_other_are_doubtful(scenario: str, seed: int) -> None:
-    """The curve jumps in depth there; a closed loop that would be left tells nothing."""
+def test_a_curve_that_jumps_in_depth_is_doubtful(scenario: str, seed: int) -> None:
+    """The views have taken strands or a highlight for each other; of those, a closed loop tells nothing."""
     scene = open_scene(scenario, seed, "endoscope")
     found = initialized(scene)
     assert is_found_right(found, scene) or found.confidence < 0.5

@@ -68,8 +68,8 @@ _SAME_WAY = 0.3
 """Cosine of the angle between two passes of a thread from which both run the same way."""
 _JUMP, _JUMP_PX, _JUMP_REACH = 2.0, 0.14, 8
 """How many times as sharply as anywhere across a curve bends in depth, and how sharply, 1/px as seen from the
-side, over so many pixels, where the views have taken strands for each other: of 828 starts seven of the 64
-wrong ones, and no right one."""
+side, over so many pixels, where the views have taken strands for each other, or a highlight has drawn one
+aside: of 828 starts seven of the 64 wrong ones, and no right one."""
 _JUMPED, _SMOOTH = 0.3, 0.5
 """What that leaves of the confidence, and the share of such a jump up to which a curve is smooth."""
 _SHARP_REST = 0.5
@@ -120,7 +120,7 @@ def judge(
     jump = _jump_in_depth(points, pixels[0], rig.left.projection[0, 0])
     if jump >= 1:
         confidence *= _JUMPED
-        reasons.append("a jump in depth, as where the views take strands for each other")
+        reasons.append("a jump in depth: a sharper bend than any across")
     doubts = _left_in_doubt(pixels, chains, ridges, is_alone=is_alone, is_smooth=jump < _SMOOTH)
     reasons += _in_words(doubts, rig, scale)
     further = [
