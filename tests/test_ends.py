@@ -180,6 +180,16 @@ def test_other_ridges_make_no_thread_shorter_at_once() -> None:
     assert known.learned(watch, 30.0, is_clear=False).now == pytest.approx(98.0, rel=1e-3)
 
 
+def test_a_loop_that_a_knot_has_drawn_in_may_show_again() -> None:
+    drawn_in, _ = settled_watch(80.0)
+    known = KnownLength(90.0).looped(90.0).looped(89.0).learned(drawn_in, 30.0, is_clear=True)
+    assert known.now == pytest.approx(80.0, rel=1e-3)
+    assert not known.watched(drawn_in).is_outgrown(90.0, 0.5)
+    assert known.watched(drawn_in).is_outgrown(93.0, 0.5)
+    assert not known.is_another(90.0, 80.0, 0.0, is_clear=False)
+    assert replace(known, with_loops=0.0).watched(drawn_in).is_outgrown(90.0, 0.5)
+
+
 def test_what_the_border_cuts_off_makes_the_rest_no_longer() -> None:
     whole, _ = settled_watch(140.0)
     cut, never_whole = EndWatch(110.0, 0), KnownLength(110.0)

@@ -217,6 +217,8 @@ class Follower:
             self._untracked_ns = model.capture_ns
         if status is Status.TRACKING:
             self.last_good = model.curve
+            if evidence.fit.crowd.itself.any():
+                self.known_length = self.known_length.looped(length_of(model.curve))
             self._memory = self._memory.learned(model.curve, self.known_length, model.capture_ns)
             known = Whole.of(model.curve, model.capture_ns) if model.ends.at_border else self._whole
             self._whole = known.learned(model.curve, model.capture_ns)

@@ -29,6 +29,8 @@ class KnownLength:
     """When the thread was last tracked and all of it seen."""
     before_cut: float = 0.0
     """Before an end of it was given up: that may have been hidden only."""
+    with_loops: float = 0.0
+    """At most, while it was tracked and touched itself: a loop that is drawn in may show again."""
     is_established: bool = False
     """Whether it was steady for long enough, with both ends in the images, to be the thread's own."""
     was_established: bool = False
@@ -39,7 +41,7 @@ class KnownLength:
     @property
     def possible(self) -> tuple[float, float]:
         """Lengths that the thread may have."""
-        return self.now, max(self.now, self.before_cut)
+        return self.now, max(self.now, self.before_cut, self.with_loops)
 
     def inherited(self, before: KnownLength, *, is_sure: bool) -> KnownLength:
         """Of a thread that was found anew.
@@ -72,6 +74,10 @@ class KnownLength:
     def again(self, length: float) -> KnownLength:
         """With what was hidden in sight again."""
         return replace(self, now=max(self.now, length))
+
+    def looped(self, length: float) -> KnownLength:
+        """Tracked with so much of it, where it touches itself."""
+        return replace(self, with_loops=max(self.with_loops, length))
 
     def learned(self, ends: EndWatch, seconds: float, *, is_clear: bool) -> KnownLength:
         """So much later; an end that is lost for a moment makes the thread no shorter, nor do other
