@@ -51,6 +51,8 @@ _LEAP_PX, _LEAPS = 5.0, 6
 _ALL = 0.97
 # And what of a lost thread has to be plain to see, where both ends are and the rest is hidden.
 _BACK = 0.7
+# Share of a curve that is seen, from which it is in sight.
+_IN_SIGHT = 0.8
 # How long after the last doubt it is certain again where the thread runs.
 _SURE_AFTER_S = 0.08
 # Standard deviation, against its length, from which on the images do not tell where a curve runs.
@@ -150,6 +152,11 @@ class Follower:
     def is_doubtful(self) -> bool:
         """Whether it has been uncertain for more than a moment where the thread runs."""
         return (self.model.capture_ns - self._certain_ns) * _NS > _PATIENCE_S
+
+    @property
+    def is_in_sight(self) -> bool:
+        """Whether most of the curve was seen in the last field."""
+        return self._share_seen >= _IN_SIGHT
 
     def strands(self, capture_ns: int) -> tuple[Strand, Strand]:
         """What is seen of the thread, where it should be at that time: others keep clear of it."""

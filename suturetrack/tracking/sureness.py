@@ -25,6 +25,8 @@ _HOPELESS = 0.01
 _SAME_PLACE, _SAME_LENGTH = 0.12, 0.002
 # Two looks see the same if they are nowhere further apart, and another thing if they are somewhere.
 _SAME_PX, _OTHER_PX = 5.0, 15.0
+# Share of one curve along which another one has little of it.
+_LITTLE = 0.3
 # How much the thread has to bend between two looks that both count.
 _BENT_PX = 2.0
 _PLACES = 64
@@ -159,6 +161,11 @@ class Sureness:
         both = zip(self._lines(found), self._lines(followed), strict=True)
         moved_px = _OTHER_PX if may_move else 0.0
         return max(_apart(whole, part, moved_px) for whole, part in both) < _SAME_PX
+
+    def is_elsewhere(self, found: Nurbs, followed: Nurbs) -> bool:
+        """Whether what was found has little of what is followed."""
+        there, here = self._lines(found)[0], self._lines(followed)[0]
+        return bool(np.mean(polyline_distances(here, there) < _SAME_PX) < _LITTLE)
 
     def lacks_more(self, found: Nurbs, followed: Nurbs) -> bool:
         """Whether what was found is a part of what is followed, and lacks more than a little."""

@@ -292,7 +292,7 @@ class Thread:
         pursuit, state = outcome.pursuit, outcome.state
         assert pursuit is not None
         assert state is not None
-        if state.curve is None:
+        if state.curve is None or self._is_another(state.curve):
             return
         is_sure = pursuit.found.confidence >= SURE
         # Where any length was looked for, nothing else tells that it is the thread.
@@ -306,6 +306,14 @@ class Thread:
             before = self._sureness if is_same else None
             is_known = self._was_sure and bool(known_lengths)
             self._hold(outcome, "found again", before, is_known=is_known)
+
+    def _is_another(self, found: Nurbs) -> bool:
+        """Whether it is another thread, which may be as long: the one that is held was sure, and is in sight
+        elsewhere."""
+        if not (self.is_held and self._was_sure and self._sureness and self.follower):
+            return False
+        curve = self.follower.model.curve
+        return self.follower.is_in_sight and self._sureness.is_elsewhere(found, curve)
 
     def _was_followed_for_sure(self, found: Nurbs) -> bool:
         """Whether it is what was followed for sure before it was lost, and beside the search."""
