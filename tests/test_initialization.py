@@ -529,14 +529,13 @@ def test_a_way_that_would_leave_a_closed_loop_makes_nothing_doubtful(
     assert found.confidence > 0.9
 
 
-@pytest.mark.parametrize(
-    ("scenario", "seed"), [("fast", 5008), ("two-threads", 5221), ("knot", 5210), ("knot", 5014)]
-)
-def test_a_curve_that_jumps_in_depth_is_doubtful(scenario: str, seed: int) -> None:
-    """The views have taken strands or a highlight for each other; of those, a closed loop tells nothing."""
-    scene = open_scene(scenario, seed, "endoscope")
+@pytest.mark.parametrize("seed", [5210, 5014])
+def test_a_loop_of_strands_that_the_views_take_for_each_other_is_doubtful(seed: int) -> None:
+    """The curve bends in depth as a knot does not."""
+    scene = open_scene("knot", seed, "endoscope")
     found = initialized(scene)
-    assert is_found_right(found, scene) or found.confidence < 0.5
+    assert not is_found_right(found, scene)
+    assert found.confidence < 0.5
 
 
 def look_at(strands: list[Float64], seed: Float64, rig: StereoRig) -> Initialization:

@@ -66,12 +66,10 @@ would leave a part of it to nobody. Of 171 such starts, 169 were right and as ma
 was in doubt."""
 _SAME_WAY = 0.3
 """Cosine of the angle between two passes of a thread from which both run the same way."""
-_JUMP, _JUMP_PX, _JUMP_REACH = 2.0, 0.14, 8
-"""How many times as sharply as anywhere across a curve bends in depth, and how sharply, 1/px as seen from the
-side, over so many pixels, where the views have taken strands for each other, or a highlight has drawn one
-aside: of 828 starts seven of the 64 wrong ones, and no right one."""
-_JUMPED, _SMOOTH = 0.3, 0.5
-"""What that leaves of the confidence, and the share of such a jump up to which a curve is smooth."""
+_DEEP_PX, _DEEP_REACH = 0.07, 8
+"""How sharply a curve may bend in depth, 1/px as seen from the side, over so many pixels, even if it bends
+less across: four starts of knots that were wrong, because the views had taken strands for each other, bent
+more, and two of 316 right ones."""
 _SHARP_REST = 0.5
 """What is left of the confidence at a sharp bend, at least, where no other ridge is near."""
 _SHARP_COSINE = 0.5
@@ -117,11 +115,8 @@ def judge(
     confidence, reasons = _of_the_whole(agreement, samples, sigma, nurbs.length(curve))
     others = max(_others(line, r) for line, r in zip(pixels, ridges, strict=True))
     is_alone = others <= _NEXT_TO_NOTHING
-    jump = _jump_in_depth(points, pixels[0], rig.left.projection[0, 0])
-    if jump >= 1:
-        confidence *= _JUMPED
-        reasons.append("a jump in depth: a sharper bend than any across")
-    doubts = _left_in_doubt(pixels, chains, ridges, is_alone=is_alone, is_smooth=jump < _SMOOTH)
+    is_smooth = _is_smooth(points, pixels[0], rig.left.projection[0, 0])
+    doubts = _left_in_doubt(pixels, chains, ridges, is_alone=is_alone, is_smooth=is_smooth)
     reasons += _in_words(doubts, rig, scale)
     further = [
         _ends_further_on(p, c.pixels, r) for p, c, r in zip(pixels, chains, ridges, strict=True)
@@ -346,16 +341,16 @@ def _run_the_same_way(passes: list[Int64], line: Float64) -> bool:
     return bool(one @ two > _SAME_WAY)
 
 
-def _jump_in_depth(points: Float64, line: Float64, focal: float) -> float:
-    """How much a curve of (k, 3) points, (k, 2) pixels, bends in depth, against one that jumps there."""
+def _is_smooth(points: Float64, line: Float64, focal: float) -> bool:
+    """Whether a curve of (k, 3) points, (k, 2) pixels, bends in depth no more sharply than across."""
     s = arc_lengths(line)
     even: Float64 = np.arange(0.0, s[-1], 1.0)
     depth = focal * np.log(np.maximum(np.interp(even, s, points[:, 2]), 1e-9))
-    seen, h = np.c_[polyline_at(line, even), depth], _JUMP_REACH
+    seen, h = np.c_[polyline_at(line, even), depth], _DEEP_REACH
     bends = seen[2 * h :] - 2 * seen[h:-h] + seen[: -2 * h]
-    across = float(np.linalg.norm(bends[:, :2], axis=1).max(initial=1e-9))
-    towards = float(np.abs(bends[:, 2]).max(initial=0.0))
-    return min(towards / (_JUMP * across), towards / (_JUMP_PX * h**2))
+    across = np.linalg.norm(bends[:, :2], axis=1).max(initial=0.0)
+    towards = np.abs(bends[:, 2]).max(initial=0.0)
+    return bool(towards < max(across, _DEEP_PX * h**2))
 
 
 def _near(doubt: Doubt, line: Float64) -> Int64:
