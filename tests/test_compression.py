@@ -42,6 +42,7 @@ def test_the_stated_deviation_is_that_of_the_curve(
     ratios = []
     for i in range(8):
         (state,) = tracker.step(segmenter.step(frame(scene, i))).states
+        assert state.status is Status.TRACKING
         assert state.curve is not None
         points = evaluate(state.curve, np.linspace(0, 1, len(state.sigma)))
         away = polyline_distances(points, scene.truth(i)[0].points)
