@@ -8,7 +8,7 @@ import pytest
 from suturetrack.camera import StereoRig
 from suturetrack.initialization import initialize
 from suturetrack.initialization.abreast import tell_apart
-from suturetrack.polylines import polyline_distances
+from suturetrack.polylines import polyline_distances, polyline_length, resample
 from suturetrack.types import Float64, RidgeField, Seed
 from tests.test_initialization import dense, draw, field_of
 
@@ -45,7 +45,7 @@ def test_the_thread_is_told_from_a_strand_that_it_crosses_twice(
     thread = at(ALONG, bow(ALONG, height), turned)
     other = at(ALONG, 0 * ALONG, turned)
     field = field_of_both(thread, other, 0.0, rig)
-    run = np.arange(-100.0, 101.0)
+    run = np.arange(-100.0, 101.0, 2.0)
     aside = bow(run, height)
     if follows_other:
         aside[np.abs(run) < LENS] = 0
@@ -56,16 +56,40 @@ def test_the_thread_is_told_from_a_strand_that_it_crosses_twice(
     left, right = tell_apart(
         (field.left, field.right), np.c_[path, path - [DISPARITY, 0]], (others, shifted)
     )
-    for told in (left.told, right.told + np.array([DISPARITY, 0])):
+    for told in (left.told[:, :2], right.told[:, :2] + [DISPARITY, 0]):
         inside = polyline_distances(told, at(np.linspace(-20, 20, 161), np.zeros(161), turned)) < 7
         assert inside.sum() > 10
         assert polyline_distances(told, thread).max() < 0.5
 
 
+@pytest.mark.parametrize("turned", [0.9, 2.0])
+@pytest.mark.parametrize("height", [-5.0, -2.5, 2.5, 5.0])
+@pytest.mark.parametrize("comes_back", [False, True])
+def test_a_thread_is_told_from_itself_where_it_crosses_itself_twice(
+    rig: StereoRig, height: float, turned: float, comes_back: bool
+) -> None:
+    """Where the path takes both of its strands to be the straight one."""
+    run = np.arange(-100.0, 100.5, 0.5)[:: -1 if comes_back else 1]
+    aside, beyond = bow(run, height), np.sign(run[0]) * 170
+    first, second = at(np.sort(run), 0 * run, turned), at(run, aside, turned)
+    corners = np.array([[170, 0], [170, 12 * height], [beyond, 12 * height], [beyond, aside[0]]])
+    loop = resample(np.r_[first[-1:], at(*corners.T, turned), second[:1]], 800)
+    taken = at(run, np.where(np.abs(run) < LENS, 0, aside), turned)
+    thread, path = (np.concatenate([first, loop, last]) for last in (second, taken))
+    field = field_of_both(thread, thread, 0.0, rig)
+    path = resample(path, int(polyline_length(path) / 2))
+    views = tell_apart((field.left, field.right), np.c_[path, path - [DISPARITY, 0]], ([], []))
+    for view, shift in zip(views, (0, DISPARITY), strict=True):
+        for strand, is_its in ((first, view.told[:, 2] < 0.5), (second, view.told[:, 2] > 0.5)):
+            told = view.told[is_its, :2] + [shift, 0]
+            assert (np.linalg.norm(told - [400, 240], axis=1) < 20).sum() > 10
+            assert polyline_distances(told, strand).max() < 0.6
+
+
 def test_a_thread_alone_is_left_as_it_is(rig: StereoRig) -> None:
     thread = at(ALONG, bow(ALONG, 5), 0.9)
     field = field_of_both(thread, thread, 0.0, rig)
-    pixels = np.c_[thread, thread - [DISPARITY, 0]][::4]
+    pixels = np.c_[thread, thread - [DISPARITY, 0]][::8]
     for view in tell_apart((field.left, field.right), pixels, ([], [])):
         assert not len(view.told)
         assert not len(view.blurred)

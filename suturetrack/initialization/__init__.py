@@ -13,6 +13,7 @@ from suturetrack.initialization.confidence import judge
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.ends import move_end, read_end
 from suturetrack.initialization.fitting import refine
+from suturetrack.initialization.flanks import runs_beside_itself
 from suturetrack.initialization.growth import grow_thread
 from suturetrack.initialization.hypotheses import Hypothesis, find_thread
 from suturetrack.initialization.knots import fit_marks, image_parameters
@@ -27,11 +28,12 @@ from suturetrack.initialization.result import (
     nearest_ridges,
     remaining,
 )
+from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import Ridges, find_ridges, nearest_segment, thread_scale
 from suturetrack.initialization.threads import Thread, follow_thread
 from suturetrack.nurbs import curve_from
-from suturetrack.polylines import nearest_index
-from suturetrack.types import Float64, Nurbs, RidgeField, Seed, read_only
+from suturetrack.polylines import nearest_index, polyline_distances
+from suturetrack.types import Float32, Float64, Nurbs, RidgeField, Seed, read_only
 
 __all__ = [
     "Growth",
@@ -46,6 +48,8 @@ __all__ = [
 
 
 _SHORTEST_STEPS = 4
+_LOOKS, _STILL_PX = 3, 0.5
+"""How often a thread that runs beside itself is told apart, and by how far it then does not move any more."""
 _FAINT = 0.15
 """Share of the thread's response below which nothing is shown of its ends."""
 _LEAST_MATCH = 0.35
@@ -191,10 +195,8 @@ def _reconstruct(start: _Start, field: RidgeField, *, are_moved: bool = False) -
         swapped = _is_matched(other)
         raise InitializationError(_no_match(swapped), start.candidates, growth, swapped=swapped)
     fields = found.left.field, field.right if found.right is None else found.right.field
-    views = tell_apart(fields, found.pixels, found.others)
     try:
-        curve = _first_curve(_trim(found.pixels, found.left), rig, config)
-        curve, samples, sigma, rows = refine(curve, views, rig, are_moved=are_moved)
+        curve, samples, sigma, rows = _fit(found, fields, rig, config, are_moved=are_moved)
     except FloatingPointError as error:
         reason = f"no curve fits both views: {error}"
         raise InitializationError(reason, start.candidates, growth) from None
@@ -209,11 +211,45 @@ def _reconstruct(start: _Start, field: RidgeField, *, are_moved: bool = False) -
     return first.meaning(either=found.left.meets_another_at(start.pixel))
 
 
+def _fit(
+    found: Hypothesis,
+    fields: tuple[Float32, Float32],
+    rig: StereoRig,
+    config: InitializationConfig,
+    *,
+    are_moved: bool,
+) -> tuple[Nurbs, Samples, Float64, float]:
+    """What `refine` makes of a thread in both views. One that runs beside itself is told apart again from
+    nearer by, for as long as that moves it."""
+    curve, pixels = _first_curve(_trim(found.pixels, found.left), rig, config), found.pixels[::2]
+    for _ in range(_LOOKS):
+        views = tell_apart(fields, pixels, found.others)
+        fit = refine(curve, views, rig, are_moved=are_moved)
+        _, samples, _, rows = fit
+        before, pixels = pixels, np.hstack(rig.with_row_offset(rows).project(samples.points))
+        if not _runs_elsewhere(pixels, before):
+            break
+        curve = fit_marks(samples.points, samples.s, _spans(samples.length_px, config))
+    return fit
+
+
+def _runs_elsewhere(pixels: Float64, before: Float64) -> bool:
+    """Whether a thread, (k, 4) left and right pixels, runs beside itself, and not where (m, 4) did."""
+    views = [(pixels[:, at : at + 2], before[:, at : at + 2]) for at in (0, 2)]
+    return any(runs_beside_itself(now) for now, _ in views) and any(
+        polyline_distances(now, then).max() > _STILL_PX for now, then in views
+    )
+
+
 def _first_curve(pixels: Float64, rig: StereoRig, config: InitializationConfig) -> Nurbs:
     """The curve through the stereo points of a (k, 4) chain, left and right pixels."""
     s = image_parameters(pixels[:, :2], pixels[:, 2:])
     points = rig.triangulate(pixels[:, :2], pixels[:, 2:])
-    return fit_marks(points, s, max(len(s) // round(2 * config.step_px), 4))
+    return fit_marks(points, s, _spans(len(s), config))
+
+
+def _spans(length_px: float, config: InitializationConfig) -> int:
+    return max(int(length_px / (2 * config.step_px)), 4)
 
 
 def _trim(pixels: Float64, left: Thread) -> Float64:

@@ -24,6 +24,8 @@ _DRAWN = 0.1
 """How much such a crest counts."""
 _BLURRED_PX, _BESIDE_PX, _FARTHEST_PX = 2.5, 1.6, 8.0
 """How far a curve may be from a pixel that is blurred, and along and across itself from one that is told."""
+_ALONG = 0.2
+"""How far away a place along the thread is, against one elsewhere."""
 _ITSELF_PX = 11.0
 """Length of a curve between two places that near, from which it comes back beside itself there."""
 
@@ -37,7 +39,8 @@ class View:
     others: Float64
     """(k, 2) pixels on the ridges of other strands, about 1 px apart."""
     told: Float64
-    """(k, 2) pixels of the thread beside other strands, as the flanks of the ridges tell them."""
+    """(k, 3) pixels of the thread beside other strands, or itself, as the flanks of the ridges tell them, and
+    the share of its length that lies before them."""
     blurred: Float64
     """(k, 2) pixels near which the ridge may be that of several strands, and nothing tells them apart."""
 
@@ -51,8 +54,11 @@ class View:
         where it is not."""
         if not len(self.told):
             return np.full(len(pixels), np.nan)
-        _, nearest = cKDTree(self.told).query(pixels)
-        there = self.told[nearest] - pixels
+        # What is told of one strand of the thread does not tell of another.
+        length = _ALONG * arc_lengths(pixels)[-1]
+        here = np.c_[pixels, np.linspace(0, length, len(pixels))]
+        _, nearest = cKDTree(self.told * (1, 1, length)).query(here)
+        there = self.told[nearest, :2] - pixels
         across = (there * normals).sum(1)
         along = np.linalg.norm(there - across[:, None] * normals, axis=1)
         return np.where((along < _BESIDE_PX) & (np.abs(across) < _FARTHEST_PX), across, np.nan)
