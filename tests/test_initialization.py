@@ -421,6 +421,24 @@ def test_strands_of_one_thread_are_told_apart(scenario: str, seed: int) -> None:
     assert found.confidence > 0.5
 
 
+@pytest.mark.parametrize("seed", [5014, 5210, 5303, 5305, 5308, 5313])
+def test_strands_of_a_knot_keep_their_sides_between_the_places_where_they_cross(seed: int) -> None:
+    """They run a few pixels apart, as one wide ridge, of which the crest is that of either."""
+    assert_is_found_whole("knot", seed, "endoscope")
+
+
+@pytest.mark.parametrize("seed", [1009, 1011, 1027])
+def test_no_part_of_a_knot_is_left_out(seed: int) -> None:
+    """A short stretch of it has the colour and the depth of both of its strands, which fits neither."""
+    assert_is_found_whole("knot", seed, "endoscope")
+
+
+@pytest.mark.parametrize("seed", [1040, 1047, 5021])
+def test_a_view_that_shows_a_knot_whole_is_believed(seed: int) -> None:
+    """However many of its crossings are in doubt, the other view has a thread and a rest."""
+    assert_is_found_whole("knot", seed, "bench")
+
+
 @pytest.mark.parametrize("seed", [301, 313, 314, 362])
 def test_strands_that_share_a_stretch_may_be_exchanged(seed: int) -> None:
     """A like thread joins this one for a while; both views take its way out for this one's."""

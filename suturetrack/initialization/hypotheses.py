@@ -102,9 +102,12 @@ def find_thread(
         return first
     mirrored = match(right.chain.pixels, field.right, field.left, -at_infinity, -1)
     through_seed = np.linalg.norm(mirrored.pixels - seed, axis=1).min() <= config.snap_px
-    if through_seed and _worth(right, mirrored, matched) > _worth(left, matched, mirrored):
-        return Hypothesis(left, right, mirrored, by_right=True)
-    return first
+    if left.is_all_there_is != right.is_all_there_is:
+        # To leave strands to nobody is worse than any doubt.
+        is_better = right.is_all_there_is
+    else:
+        is_better = _worth(right, mirrored, matched) > _worth(left, matched, mirrored)
+    return Hypothesis(left, right, mirrored, by_right=True) if through_seed and is_better else first
 
 
 def _agreement(one: Float64, other: Float64) -> float:

@@ -28,7 +28,7 @@ _SWING = 0.01
 _BRIDGE_SAMPLES = 12
 _AT_ONCE = 4096
 """Pairs priced in one go, so that much clutter takes no more memory."""
-_STRAND, _STRAND_STRENGTH = 20, 0.5
+STRAND, _STRAND_STRENGTH = 20, 0.5
 """Points, and strength against the average, from which a segment may be a part of a thread, and no speck
 or rim."""
 TOUCHING_PX = 6.0
@@ -56,9 +56,13 @@ class Merges:
     alike: Bool
     """(m,) whether both are near and of strands as strong as any: a thread may turn round there."""
 
-    def of_one_thread(self) -> Merges:
-        """Those that are no dearer than two ends, or of ends that are alike."""
-        kept = (self.cost < HIGHEST) | self.alike
+    @property
+    def may_be_one_thread(self) -> Bool:
+        """(m,) which are no dearer than two ends, or of ends that are alike."""
+        return (self.cost < HIGHEST) | self.alike
+
+    def where(self, kept: Bool) -> Merges:
+        """Some of them, (m,)."""
         return Merges(self.pairs[kept], self.cost[kept], self.touching[kept], self.alike[kept])
 
 
@@ -115,7 +119,7 @@ def price_merges(ridges: Ridges, config: InitializationConfig) -> Merges:
     ratio = np.minimum(*(abs(np.log(s[i] / s[j])) for s in (near, whole)))
     cost = shape + 0.25 * ratio**2 + _SHORT * np.maximum(short[i], short[j])
     touching = (distance < TOUCHING_PX) & (weakest >= config.low)
-    is_strand = (size >= _STRAND) & (whole > _STRAND_STRENGTH * np.average(whole, weights=size))
+    is_strand = (size >= STRAND) & (whole > _STRAND_STRENGTH * np.average(whole, weights=size))
     alike = (distance < 2 * TOUCHING_PX) & is_strand[i] & is_strand[j]
     return Merges(pairs, cost, touching, alike)
 

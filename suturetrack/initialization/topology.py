@@ -12,7 +12,14 @@ from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.hairpins import double_stubs
 from suturetrack.initialization.joints import Joints, Pair, inward
-from suturetrack.initialization.pricing import DEAR_END, FEW_ENDS, FREE_END, Merges, price_merges
+from suturetrack.initialization.pricing import (
+    DEAR_END,
+    FEW_ENDS,
+    FREE_END,
+    STRAND,
+    Merges,
+    price_merges,
+)
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.initialization.smoothness import roughness
 from suturetrack.polylines import unit
@@ -30,6 +37,8 @@ _ONE_STRAND = 2.5
 """Energy up to which two arms with a hidden stretch in between are one strand."""
 _AS_STRONG = 0.5
 """Ratio of their strengths, at least."""
+_CLEAR = 0.5
+"""Strength, against that of the strongest segment that is no speck, from which an end is one of a thread."""
 _FACING = 0.5
 """Cosine of the angle by which an end may miss another one that it points at."""
 
@@ -38,20 +47,29 @@ def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None
     """Pairs up the ends so that all merges and free ends together cost least (almost: by exchange).
 
     Ends whose arms differ in colour are dearer to join, and with `depth` those whose arms differ in that.
-    Where the view shows hardly anything but a thread, free ends are dearer if that leaves its own two.
+    Where a view shows little but a thread, free ends are dearer if that leaves its own two.
     """
     if not ridges.segments:
         return Joints([], {})
-    merges = price_merges(ridges, config)
-    first = _merge(ridges, merges, None)
-    arms = Arms(first.segments, first.partner, merges, depth, ridges.tints, roughness(ridges))
-    merges = arms.with_steps(merges)
+    shapes = price_merges(ridges, config)
+    first = _merge(ridges, shapes, None)
+    arms = Arms(first.segments, first.partner, shapes, depth, ridges.tints, roughness(ridges))
+    merges = arms.with_steps(shapes)
     joints = _merge(ridges, merges, arms)
-    if 2 < len(joints.free) <= FEW_ENDS:
-        one_thread = _merge(ridges, merges.of_one_thread(), arms, DEAR_END)
-        if len(one_thread.free) == 2:
+    if 2 < _clear_ends(joints, ridges) <= FEW_ENDS:
+        # Beside another strand an arm has the colour and the depth of both: only its shape must fit.
+        one_thread = _merge(ridges, merges.where(shapes.may_be_one_thread), arms, DEAR_END)
+        if _clear_ends(one_thread, ridges) == 2:
             return one_thread
     return joints
+
+
+def _clear_ends(joints: Joints, ridges: Ridges) -> int:
+    """How many ends of strands about as strong as the strongest are free."""
+    strength = np.array([np.median(ridges.sample(segment)) for segment in joints.segments])
+    is_long = np.array([len(segment) >= STRAND for segment in joints.segments])
+    level = _CLEAR * strength[is_long | ~is_long.any()].max()
+    return sum(strength[end // 2] > level for end in joints.free)
 
 
 def _merge(ridges: Ridges, merges: Merges, arms: Arms | None, free_end: float = FREE_END) -> Joints:
