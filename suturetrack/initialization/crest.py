@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,8 +25,8 @@ _DRAWN = 0.1
 """How much such a crest counts."""
 _BLURRED_PX, _BESIDE_PX, _FARTHEST_PX = 2.5, 1.6, 8.0
 """How far a curve may be from a pixel that is blurred, and along and across itself from one that is told."""
-_ALONG = 0.2
-"""How far away a place along the thread is, against one elsewhere."""
+_ALONG_PX = 100.0
+"""How far off a place counts that is as near, but on another strand, the whole length of the thread away."""
 _ITSELF_PX = 11.0
 """Length of a curve between two places that near, from which it comes back beside itself there."""
 
@@ -49,15 +50,18 @@ class View:
         aside = is_near(pixels, self.others, _ASIDE_PX) | is_near(pixels, self.blurred, _BLURRED_PX)
         return np.where(aside, _DRAWN, 1.0)
 
+    @cached_property
+    def _told(self) -> cKDTree:
+        return cKDTree(self.told * (1, 1, _ALONG_PX))
+
     def told_beside(self, pixels: Float64, normals: Float64) -> Float64:
         """(k,) signed distance from (k, 2) pixels to where the thread is told along (k, 2) normals, px; NaN
         where it is not."""
         if not len(self.told):
             return np.full(len(pixels), np.nan)
         # What is told of one strand of the thread does not tell of another.
-        length = _ALONG * arc_lengths(pixels)[-1]
-        here = np.c_[pixels, np.linspace(0, length, len(pixels))]
-        _, nearest = cKDTree(self.told * (1, 1, length)).query(here)
+        here = np.c_[pixels, np.linspace(0, _ALONG_PX, len(pixels))]
+        _, nearest = self._told.query(here)
         there = self.told[nearest, :2] - pixels
         across = (there * normals).sum(1)
         along = np.linalg.norm(there - across[:, None] * normals, axis=1)
