@@ -547,15 +547,6 @@ def test_a_way_that_would_leave_a_closed_loop_makes_nothing_doubtful(
     assert found.confidence > 0.9
 
 
-@pytest.mark.parametrize("seed", [5210, 5014])
-def test_a_loop_of_strands_that_the_views_take_for_each_other_is_doubtful(seed: int) -> None:
-    """The curve bends in depth as a knot does not."""
-    scene = open_scene("knot", seed, "endoscope")
-    found = initialized(scene)
-    assert not is_found_right(found, scene)
-    assert found.confidence < 0.5
-
-
 def look_at(strands: list[Float64], seed: Float64, rig: StereoRig) -> Initialization:
     """The thread through a seed (2,), among strands at one depth."""
     left, right = None, None

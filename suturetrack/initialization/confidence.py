@@ -66,10 +66,6 @@ would leave a part of it to nobody. Of 171 such starts, 169 were right and as ma
 was in doubt."""
 _SAME_WAY = 0.3
 """Cosine of the angle between two passes of a thread from which both run the same way."""
-_DEEP_PX, _DEEP_REACH = 0.07, 8
-"""How sharply a curve may bend in depth, 1/px as seen from the side, over so many pixels, even if it bends
-less across: four starts of knots that were wrong, because the views had taken strands for each other, bent
-more, and two of 316 right ones."""
 _SHARP_REST = 0.5
 """What is left of the confidence at a sharp bend, at least, where no other ridge is near."""
 _SHARP_COSINE = 0.5
@@ -109,14 +105,13 @@ def judge(
         rig: the cameras.
         scale: what makes the pixels of all these those of the whole image.
     """
-    points = nurbs.evaluate(curve, np.linspace(0, 1, 32 * len(curve.control_points)))
-    pixels = rig.project(points)
+    fine = np.linspace(0, 1, 32 * len(curve.control_points))
+    pixels = rig.project(nurbs.evaluate(curve, fine))
     agreement = min(_agreement(p, c.pixels, rig) for p, c in zip(pixels, chains, strict=True))
     confidence, reasons = _of_the_whole(agreement, samples, sigma, nurbs.length(curve))
     others = max(_others(line, r) for line, r in zip(pixels, ridges, strict=True))
     is_alone = others <= _NEXT_TO_NOTHING
-    is_smooth = _is_smooth(points, pixels[0], rig.left.projection[0, 0])
-    doubts = _left_in_doubt(pixels, chains, ridges, is_alone=is_alone, is_smooth=is_smooth)
+    doubts = _left_in_doubt(pixels, chains, ridges, is_alone=is_alone)
     reasons += _in_words(doubts, rig, scale)
     further = [
         _ends_further_on(p, c.pixels, r) for p, c, r in zip(pixels, chains, ridges, strict=True)
@@ -157,14 +152,11 @@ def _left_in_doubt(
     ridges: tuple[Ridges, Ridges],
     *,
     is_alone: bool,
-    is_smooth: bool,
 ) -> list[list[Doubt]]:
-    """What each view still doubts once the whole curve is known; `lines` are the curve in both views, and
-    `is_smooth` tells whether it is in depth as well."""
+    """What each view still doubts once the whole curve is known; `lines` are the curve in both views."""
     doubts = [_settled(_distinct(c), p, r) for c, p, r in zip(chains, lines, ridges, strict=True)]
     doubts = [_confirmed(view, doubts, lines) for view in (0, 1)]
-    if is_smooth:
-        doubts = [_without_loops(d, p) for d, p in zip(doubts, lines, strict=True)]
+    doubts = [_without_loops(d, p) for d, p in zip(doubts, lines, strict=True)]
     if not is_alone:
         return doubts
     return [[_of_itself(d, p) for d in of_view] for of_view, p in zip(doubts, lines, strict=True)]
@@ -339,18 +331,6 @@ def _run_the_same_way(passes: list[Int64], line: Float64) -> bool:
         return False
     one, two = (unit(line[near[-1]] - line[near[0]]) for near in passes)
     return bool(one @ two > _SAME_WAY)
-
-
-def _is_smooth(points: Float64, line: Float64, focal: float) -> bool:
-    """Whether a curve of (k, 3) points, (k, 2) pixels, bends in depth no more sharply than across."""
-    s = arc_lengths(line)
-    even: Float64 = np.arange(0.0, s[-1], 1.0)
-    depth = focal * np.log(np.maximum(np.interp(even, s, points[:, 2]), 1e-9))
-    seen, h = np.c_[polyline_at(line, even), depth], _DEEP_REACH
-    bends = seen[2 * h :] - 2 * seen[h:-h] + seen[: -2 * h]
-    across = np.linalg.norm(bends[:, :2], axis=1).max(initial=0.0)
-    towards = np.abs(bends[:, 2]).max(initial=0.0)
-    return bool(towards < max(across, _DEEP_PX * h**2))
 
 
 def _near(doubt: Doubt, line: Float64) -> Int64:
