@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from suturetrack.types import Float64
+from suturetrack.types import Bool, Float64
+
+Run = tuple[int, int]
+"""The first point of a stretch, and that behind the last one."""
 
 
 def polyline_length(points: Float64) -> float:
@@ -38,6 +41,12 @@ def polyline_tangents(points: Float64) -> Float64:
 def unit(vectors: Float64) -> Float64:
     """(..., dim) vectors at length 1; those of next to no length stay so."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+
+
+def runs_of(flags: Bool) -> list[Run]:
+    """The stretches of a polyline of which all (k,) points are flagged, in order."""
+    bounds = np.flatnonzero(np.diff(flags, prepend=False, append=False))
+    return [(start, stop) for start, stop in bounds.reshape(-1, 2).tolist()]
 
 
 def nearest_index(points: Float64, place: Float64) -> int:

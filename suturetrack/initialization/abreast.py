@@ -10,9 +10,9 @@ from itertools import product
 import numpy as np
 
 from suturetrack.initialization.crest import View
-from suturetrack.initialization.flanks import NOWHERE, Flanks, Run, look_beside, runs_of
+from suturetrack.initialization.flanks import NOWHERE, Flanks, look_beside
 from suturetrack.initialization.smoothness import depth_energy, shape_energy
-from suturetrack.polylines import arc_lengths
+from suturetrack.polylines import Run, arc_lengths, runs_of
 from suturetrack.types import Float32, Float64, Int64
 
 _CONTEXT, _NEXT, _MOST_STRETCHES = 15, 8, 6

@@ -16,7 +16,8 @@ from suturetrack.initialization.joints import Joints, Way, inward
 from suturetrack.initialization.segments import Ridges
 from suturetrack.initialization.smoothness import bending, roughness, step
 from suturetrack.initialization.threads import Thread
-from suturetrack.types import Bool, Float64, Int64
+from suturetrack.polylines import Run, runs_of
+from suturetrack.types import Float64, Int64
 
 _TOUCHING_PX = 3.0
 """Distance below which two strands draw each other's crests aside."""
@@ -116,7 +117,7 @@ def contacts(thread: Thread, ridges: Ridges, depth: Depth) -> list[Contact]:
         is_near = np.asarray(tree.query(other.points)[0]) < _TOUCHING_PX
         if not is_near.any():
             continue
-        for touches in _touches(own.points, other.points, _runs(is_near)):
+        for touches in _touches(own.points, other.points, runs_of(is_near)):
             line = other
             if not _run_alike(own.points, other.points, touches):
                 line, touches = _turned(thread.joints, other, touches)
@@ -126,16 +127,16 @@ def contacts(thread: Thread, ridges: Ridges, depth: Depth) -> list[Contact]:
     return found
 
 
-_Touch = tuple[tuple[int, int], tuple[int, int]]
+_Touch = tuple[Run, Run]
 """The first point, and that behind the last one, of the stretches of two lines that touch there."""
 
 
-def _touches(own: Float64, other: Float64, others: list[tuple[int, int]]) -> Iterator[list[_Touch]]:
+def _touches(own: Float64, other: Float64, others: list[Run]) -> Iterator[list[_Touch]]:
     """Where two lines (k, 2) and (m, 2) touch, of the second in those runs, in order along the first; what is
     near together at once."""
     distance, nearest = map(np.asarray, cKDTree(other).query(own))
     found: list[_Touch] = []
-    for start, stop in _runs(distance < _TOUCHING_PX):
+    for start, stop in runs_of(distance < _TOUCHING_PX):
         if found and start - found[-1][0][1] >= _TOGETHER:
             yield found
             found = []
@@ -145,12 +146,6 @@ def _touches(own: Float64, other: Float64, others: list[tuple[int, int]]) -> Ite
         found.append(((start, stop), (first, last)))
     if found:
         yield found
-
-
-def _runs(flags: Bool) -> list[tuple[int, int]]:
-    """The first, and that behind the last one, of runs of flags."""
-    bounds = np.flatnonzero(np.diff(flags, prepend=False, append=False))
-    return [(int(start), int(stop)) for start, stop in bounds.reshape(-1, 2)]
 
 
 def _whole(touches: list[_Touch]) -> _Touch:
@@ -213,7 +208,7 @@ class _Line:
         )
 
     @cached_property
-    def _gaps(self) -> list[tuple[int, int]]:
+    def _gaps(self) -> list[Run]:
         """The long ones: the first point in each, and that behind the last one."""
         starts = np.searchsorted(self.segment, np.arange(len(self.sizes)))
         stops = np.r_[starts[1:], len(self.segment)]

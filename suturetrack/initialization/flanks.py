@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from suturetrack.initialization.crest import is_near
 from suturetrack.kernels import search
-from suturetrack.polylines import arc_lengths, polyline_tangents
+from suturetrack.polylines import Run, arc_lengths, polyline_tangents, runs_of
 from suturetrack.types import Bool, Float32, Float64, Int64
 
 _ACROSS = np.arange(-10.0, 10.01, 0.5)
@@ -49,9 +49,6 @@ _LEAST_ALONG = 10
 NOWHERE: Float64 = np.empty((0, 2))
 _LEAST_SLOPE = 0.25
 """Sine of the angle to the epipolar lines from which a place tells a disparity."""
-
-Run = tuple[int, int]
-"""First sample of a stretch, and that behind the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,12 +177,6 @@ def _twins(path: Float64) -> Int64:
     one, other = pairs[np.argsort(-apart)].T
     twin[one] = other  # The nearest last.
     return twin
-
-
-def runs_of(flags: Bool) -> list[Run]:
-    """The stretches of (k,) samples that are flagged."""
-    bounds = np.flatnonzero(np.diff(flags, prepend=False, append=False))
-    return [(start, stop) for start, stop in bounds.reshape(-1, 2).tolist()]
 
 
 def _leading_away(pixels: Float64, others: Sequence[Float64]) -> Float64:
