@@ -591,6 +591,21 @@ def test_a_curve_that_was_revoked_is_sure_again_once_it_has_moved(rig: StereoRig
     assert sureness.is_sure
 
 
+@pytest.mark.parametrize(("count", "is_enough"), [(3, True), (12, False)])
+def test_the_more_looks_there_were_the_more_votes_it_takes(
+    rig: StereoRig, count: int, is_enough: bool
+) -> None:
+    """Of many looks at what is wrong some think it right."""
+    first, *others = (look_at(rig, thread(0.6 * turn), 0.6) for turn in range(3))
+    sureness = Sureness(replace(first, confidence=0.2), first.curve, 0, rig)
+    for turn in range(count):
+        assert sureness.asks_for_look(first.curve, 10_000_000_000 * (turn + 1))
+    for look in others:
+        assert not sureness.is_sure
+        sureness.weigh(look, look.curve)
+    assert sureness.is_sure == is_enough
+
+
 @pytest.mark.parametrize(("confidence", "at_once"), [(0.6, False), (0.8, True)])
 def test_a_first_look_that_is_not_plain_needs_a_second_one(
     rig: StereoRig, confidence: float, at_once: bool

@@ -16,8 +16,9 @@ SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
 # And that of one that needs no other: the first one, and one after looks that were in doubt.
 _AT_ONCE, _SINGLE = 0.75, 0.9
-# Votes that make a curve sure, if no doubt stays: of a sure look one, and half of one of others.
-_ENOUGH = 1.5
+# Votes that make a curve sure, if no doubt stays: of a sure look one, and half of one of others; and of one
+# that was looked at often, against the number of looks.
+_ENOUGH, _OFTEN_ENOUGH = 1.5, 0.3
 # Votes below which a curve is not worth looking from, and a look settles no doubts.
 _HOPELESS = 0.01
 # How far apart two doubts about one place are, and by how much the lengths of what is one curve differ: the
@@ -191,7 +192,8 @@ class Sureness:
             self.confidence = max(self.confidence, found.confidence)
         elif votes > self._votes or found.confidence >= SURE > self.confidence:
             self._begin(found, votes)
-        is_enough = self._votes >= _ENOUGH and remaining(self._doubts) >= SURE
+        enough = max(_ENOUGH, _OFTEN_ENOUGH * self._looks)
+        is_enough = self._votes >= enough and remaining(self._doubts) >= SURE
         is_known = self._known_length is not None and has_length(found.curve, (self._known_length,))
         self.is_sure = is_enough or found.confidence >= (SURE if is_known else _SINGLE)
 
