@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -23,6 +25,7 @@ from suturetrack.initialization.pricing import (
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.initialization.smoothness import roughness
 from suturetrack.polylines import unit
+from suturetrack.types import Bool, Float64
 
 _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""
@@ -39,6 +42,9 @@ _AS_STRONG = 0.5
 """Ratio of their strengths, at least."""
 _CLEAR = 0.5
 """Strength, against that of the strongest segment that is no speck, from which an end is one of a thread."""
+_TOUCHED_PX, _LEAST_PART = 12.0, 8
+"""How far from a segment an end is that touches it, and how many points there are at least of each part if it
+is divided there."""
 _FACING = 0.5
 """Cosine of the angle by which an end may miss another one that it points at."""
 
@@ -47,29 +53,68 @@ def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None
     """Pairs up the ends so that all merges and free ends together cost least (almost: by exchange).
 
     Ends whose arms differ in colour are dearer to join, and with `depth` those whose arms differ in that.
-    Where a view shows little but a thread, free ends are dearer if that leaves its own two.
+    Where a view shows little but a thread, free ends are dearer if that leaves its own two, and a segment on
+    which others end is divided there if it takes that.
     """
     if not ridges.segments:
         return Joints([], {})
+    joints = _pair_up(ridges, config, depth)
+    ends = _clear_ends(joints, ridges)
+    if 2 < len(ends) <= FEW_ENDS:
+        divided = _divided(ridges, ends)
+        if len(divided.segments) > len(ridges.segments):
+            one_thread = _pair_up(divided, config, depth)
+            if len(_clear_ends(one_thread, divided)) == 2:
+                return one_thread
+    return joints
+
+
+def _pair_up(ridges: Ridges, config: InitializationConfig, depth: Depth | None) -> Joints:
+    """The ends of segments as they are."""
     shapes = price_merges(ridges, config)
     first = _merge(ridges, shapes, None)
     arms = Arms(first.segments, first.partner, shapes, depth, ridges.tints, roughness(ridges))
     merges = arms.with_steps(shapes)
     joints = _merge(ridges, merges, arms)
-    if 2 < _clear_ends(joints, ridges) <= FEW_ENDS:
+    if 2 < len(_clear_ends(joints, ridges)) <= FEW_ENDS:
         # Beside another strand an arm has the colour and the depth of both: only its shape must fit.
         one_thread = _merge(ridges, merges.where(shapes.may_be_one_thread), arms, DEAR_END)
-        if _clear_ends(one_thread, ridges) == 2:
+        if len(_clear_ends(one_thread, ridges)) == 2:
             return one_thread
     return joints
 
 
-def _clear_ends(joints: Joints, ridges: Ridges) -> int:
-    """How many ends of strands about as strong as the strongest are free."""
-    strength = np.array([np.median(ridges.sample(segment)) for segment in joints.segments])
-    is_long = np.array([len(segment) >= STRAND for segment in joints.segments])
-    level = _CLEAR * strength[is_long | ~is_long.any()].max()
-    return sum(strength[end // 2] > level for end in joints.free)
+def _clear_ends(joints: Joints, ridges: Ridges) -> list[int]:
+    """The free ends of strands about as strong as the strongest."""
+    is_clear = _are_clear(joints.segments, ridges)
+    return [end for end in joints.free if is_clear[end // 2]]
+
+
+def _are_clear(segments: Sequence[Float64], ridges: Ridges) -> Bool:
+    """(n,) which segments are about as strong as the strongest."""
+    strength = np.array([np.median(ridges.sample(segment)) for segment in segments])
+    is_long = np.array([len(segment) >= STRAND for segment in segments])
+    return np.asarray(strength > _CLEAR * strength[is_long | ~is_long.any()].max())
+
+
+def _divided(ridges: Ridges, ends: list[int]) -> Ridges:
+    """The ridges, of which those that are clear are divided where some ends touch them."""
+    segments = list(ridges.segments)
+    clear = np.flatnonzero(_are_clear(segments, ridges)).tolist()
+    for end in ends:
+        if end // 2 >= len(ridges.segments):
+            continue
+        place = inward(ridges.segments, end)[0]
+        for k in clear:
+            away = np.linalg.norm(segments[k] - place, axis=1)
+            at = int(away.argmin())
+            is_inside = _LEAST_PART <= at < len(away) - _LEAST_PART
+            if k != end // 2 and is_inside and away[at] < _TOUCHED_PX:
+                clear.append(len(segments))
+                segments.append(segments[k][at:])
+                segments[k] = segments[k][:at]
+                break
+    return replace(ridges, segments=tuple(segments))
 
 
 def _merge(ridges: Ridges, merges: Merges, arms: Arms | None, free_end: float = FREE_END) -> Joints:
