@@ -54,14 +54,13 @@ def merge_ends(ridges: Ridges, config: InitializationConfig, depth: Depth | None
 
     Ends whose arms differ in colour are dearer to join, and with `depth` those whose arms differ in that.
     Where a view shows little but a thread, free ends are dearer if that leaves its own two, and a segment on
-    which others end is divided there if it takes that.
+    whose side a loop ends is divided there if it takes that.
     """
     if not ridges.segments:
         return Joints([], {})
     joints = _pair_up(ridges, config, depth)
-    ends = _clear_ends(joints, ridges)
-    if 2 < len(ends) <= FEW_ENDS:
-        divided = _divided(ridges, ends)
+    if 2 < len(_clear_ends(joints, ridges)) <= FEW_ENDS:
+        divided = _divided(ridges, joints)
         if len(divided.segments) > len(ridges.segments):
             one_thread = _pair_up(divided, config, depth)
             if len(_clear_ends(one_thread, divided)) == 2:
@@ -97,24 +96,34 @@ def _are_clear(segments: Sequence[Float64], ridges: Ridges) -> Bool:
     return np.asarray(strength > _CLEAR * strength[is_long | ~is_long.any()].max())
 
 
-def _divided(ridges: Ridges, ends: list[int]) -> Ridges:
-    """The ridges, of which those that are clear are divided where some ends touch them."""
+def _divided(ridges: Ridges, joints: Joints) -> Ridges:
+    """The ridges, of which those that are clear are divided where both ends of a strand touch others."""
+    clear = np.flatnonzero(_are_clear(ridges.segments, ridges)).tolist()
+    touched = {end: _touched(end, clear, ridges, joints) for end in _clear_ends(joints, ridges)}
     segments = list(ridges.segments)
-    clear = np.flatnonzero(_are_clear(segments, ridges)).tolist()
-    for end in ends:
-        if end // 2 >= len(ridges.segments):
+    for end, place in touched.items():
+        if place is None or touched.get(joints.other_end(end)) is None:
             continue
-        place = inward(ridges.segments, end)[0]
-        for k in clear:
-            away = np.linalg.norm(segments[k] - place, axis=1)
-            at = int(away.argmin())
-            is_inside = _LEAST_PART <= at < len(away) - _LEAST_PART
-            if k != end // 2 and is_inside and away[at] < _TOUCHED_PX:
-                clear.append(len(segments))
+        for k in [*clear, *range(len(ridges.segments), len(segments))]:
+            at = int(np.linalg.norm(segments[k] - place, axis=1).argmin())
+            if (segments[k][at] == place).all() and _LEAST_PART <= at < len(
+                segments[k]
+            ) - _LEAST_PART:
                 segments.append(segments[k][at:])
                 segments[k] = segments[k][:at]
                 break
     return replace(ridges, segments=tuple(segments))
+
+
+def _touched(end: int, clear: list[int], ridges: Ridges, joints: Joints) -> Float64 | None:
+    """(2,) the point of another strand that the end of one touches; None if it does not."""
+    own = {entry // 2 for entry in joints.follow(end // 2)}
+    others = [ridges.segments[k] for k in clear if k not in own]
+    if not others:
+        return None
+    points, place = np.concatenate(others), inward(joints.segments, end)[0]
+    away = np.linalg.norm(points - place, axis=1)
+    return points[away.argmin()] if away.min() < _TOUCHED_PX else None
 
 
 def _merge(ridges: Ridges, merges: Merges, arms: Arms | None, free_end: float = FREE_END) -> Joints:
