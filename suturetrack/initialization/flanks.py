@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -111,7 +110,7 @@ class Flanks:
         may_be_two = (self.shared | (self.beside != 0)) & ~np.isfinite(self.noise(side))
         return self.pixels[may_be_two & self.tells_depth]
 
-    @cached_property
+    @property
     def unknown(self) -> list[Run]:
         """The stretches in which the thread runs on either side of another strand, or of itself."""
         runs = runs_of(self.shared & (self.wider > _TWO_PX))

@@ -98,32 +98,31 @@ def _are_clear(segments: Sequence[Float64], ridges: Ridges) -> Bool:
 
 def _divided(ridges: Ridges, joints: Joints) -> Ridges:
     """The ridges, of which those that are clear are divided where both ends of a strand touch others."""
-    clear = np.flatnonzero(_are_clear(ridges.segments, ridges)).tolist()
-    touched = {end: _touched(end, clear, ridges, joints) for end in _clear_ends(joints, ridges)}
-    segments = list(ridges.segments)
+    touched = {end: _touched(end, ridges, joints) for end in _clear_ends(joints, ridges)}
+    cuts: dict[int, list[int]] = {}
     for end, place in touched.items():
-        if place is None or touched.get(joints.other_end(end)) is None:
-            continue
-        for k in [*clear, *range(len(ridges.segments), len(segments))]:
-            at = int(np.linalg.norm(segments[k] - place, axis=1).argmin())
-            if (segments[k][at] == place).all() and _LEAST_PART <= at < len(
-                segments[k]
-            ) - _LEAST_PART:
-                segments.append(segments[k][at:])
-                segments[k] = segments[k][:at]
-                break
+        if place is not None and touched.get(joints.other_end(end)) is not None:
+            k, at = place
+            bounds = np.array([0, len(ridges.segments[k]), *cuts.get(k, ())])
+            if np.abs(bounds - at).min() >= _LEAST_PART:
+                cuts.setdefault(k, []).append(at)
+    segments = list(ridges.segments)
+    for k, places in cuts.items():
+        segments[k], *rest = np.split(segments[k], sorted(places))
+        segments += rest
     return replace(ridges, segments=tuple(segments))
 
 
-def _touched(end: int, clear: list[int], ridges: Ridges, joints: Joints) -> Float64 | None:
-    """(2,) the point of another strand that the end of one touches; None if it does not."""
-    own = {entry // 2 for entry in joints.follow(end // 2)}
-    others = [ridges.segments[k] for k in clear if k not in own]
-    if not others:
+def _touched(end: int, ridges: Ridges, joints: Joints) -> tuple[int, int] | None:
+    """The clear segment of another strand that the end of one touches, and the point of it; None if none."""
+    own = {joints.original(entry) // 2 for entry in joints.follow(end // 2)}
+    clear = np.flatnonzero(_are_clear(ridges.segments, ridges)).tolist()
+    place = inward(joints.segments, end)[0]
+    away = {k: np.linalg.norm(ridges.segments[k] - place, axis=1) for k in clear if k not in own}
+    k = min(away, key=lambda k: away[k].min(), default=-1)
+    if k < 0 or away[k].min() >= _TOUCHED_PX:
         return None
-    points, place = np.concatenate(others), inward(joints.segments, end)[0]
-    away = np.linalg.norm(points - place, axis=1)
-    return points[away.argmin()] if away.min() < _TOUCHED_PX else None
+    return k, int(away[k].argmin())
 
 
 def _merge(ridges: Ridges, merges: Merges, arms: Arms | None, free_end: float = FREE_END) -> Joints:
