@@ -21,7 +21,7 @@ from suturetrack.initialization.doubts import (
 from suturetrack.initialization.result import PlacedDoubts, in_words, remaining
 from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import ARM, Ridges
-from suturetrack.initialization.threads import Chain
+from suturetrack.initialization.threads import NEXT_TO_NOTHING, Chain
 from suturetrack.polylines import (
     arc_lengths,
     coverage,
@@ -58,8 +58,6 @@ _BESIDE_PX = 5.0
 """Distance from a curve up to which a ridge is the rim of the thread or its highlight."""
 _FAINT = 0.4
 """Strength of a ridge, against the thread's, below which it is not another thread's."""
-_NEXT_TO_NOTHING = 0.1
-"""Length of other ridges, against the thread's, up to which it is alone."""
 _ALONE = 4.0
 """How many times better the odds are that a thread that is alone goes on as it was found to: another way
 would leave a part of it to nobody. Of 171 such starts, 169 were right and as many in order, however much
@@ -110,7 +108,7 @@ def judge(
     agreement = min(_agreement(p, c.pixels, rig) for p, c in zip(pixels, chains, strict=True))
     confidence, reasons = _of_the_whole(agreement, samples, sigma, nurbs.length(curve))
     others = max(_others(line, r) for line, r in zip(pixels, ridges, strict=True))
-    is_alone = others <= _NEXT_TO_NOTHING
+    is_alone = others <= NEXT_TO_NOTHING
     doubts = _left_in_doubt(pixels, chains, ridges, is_alone=is_alone)
     reasons += _in_words(doubts, rig, scale)
     further = [

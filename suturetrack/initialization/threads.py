@@ -52,7 +52,7 @@ _SHORTEST_TAIL = 24
 """Points that go on so, at least: what is shorter may be the thread's own end, in the shade."""
 _AS_CLEAR = 0.6
 """Strength of another strand, against the thread's, from which it might be meant as well."""
-_AS_STRONG, _NEXT_TO_NOTHING = 0.75, 0.1
+_AS_STRONG, NEXT_TO_NOTHING = 0.75, 0.1
 """Strength, and length, of other strands, against the thread's, from which a view shows more than it."""
 _MEETS_PX, _BRIDGED_PX = 5.0, 12.0
 """By how much farther from a seed than the thread it may run there, and how far from there its segments end
@@ -188,7 +188,7 @@ class Thread:
     def is_all_there_is(self) -> bool:
         """Whether next to none of the ridges of the view that are as strong is left to other strands."""
         others = sum(len(self.ridges.segments[k]) for k in self._others(_AS_STRONG))
-        return others <= _NEXT_TO_NOTHING * len(self.chain.pixels)
+        return others <= NEXT_TO_NOTHING * len(self.chain.pixels)
 
     def _is_as_clear(self, entries: list[int]) -> bool:
         """Whether a strand that enters its segments there is as clear as the thread where it runs alone."""
