@@ -50,6 +50,7 @@ class Arms:
         self._tints, self._roughness = tints, roughness
         self._leads = {} if merges is None else _leads(merges, partner)
         self._arms: dict[int, Float64] = {}
+        self._bends: dict[Pair, float] = {}
         self._disparities: dict[int, Disparities | None] = {}
         self._colours: dict[int, Float64] = {}
 
@@ -95,11 +96,14 @@ class Arms:
 
     def _bend(self, i: int, j: int) -> float:
         """How much more the arms of two ends have to bend as one strand than as two."""
-        one, other = (
-            arm[min(_SKIPPED, len(arm) // 4) : _SHAPE_POINTS : _EVERY]
-            for arm in (self._arm(i), self._arm(j))
-        )
-        return bend(one, other, self._roughness)
+        pair = min(i, j), max(i, j)
+        if pair not in self._bends:
+            one, other = (
+                arm[min(_SKIPPED, len(arm) // 4) : _SHAPE_POINTS : _EVERY]
+                for arm in map(self._arm, pair)
+            )
+            self._bends[pair] = bend(one, other, self._roughness)
+        return self._bends[pair]
 
     def _step(self, i: int, j: int) -> float:
         """Energy of a step in depth from one arm to the other."""

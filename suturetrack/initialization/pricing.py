@@ -104,7 +104,7 @@ def price_merges(ridges: Ridges, config: InitializationConfig) -> Merges:
     tips = _Tips.of(ridges.segments, _CLEAR)
     near = tips.strength(ridges)
     # A highlight at a junction fades one arm of a segment, and not the segment.
-    whole = np.repeat([np.median(ridges.sample(s)) for s in ridges.segments], 2)
+    whole = np.repeat(ridges.strengths, 2)
     size = np.repeat([len(s) for s in ridges.segments], 2)
     short = np.maximum(1 - size / ARM, 0.0)
     positions = tips.points[:, 0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import cv2
@@ -63,6 +64,11 @@ class Ridges:
     """||V|| below which a pixel is background."""
     tints: Tints | None = None
     """None where the images are gray."""
+
+    @cached_property
+    def strengths(self) -> Float64:
+        """(n,) the median ||V|| of each segment."""
+        return np.array([np.median(self.sample(segment)) for segment in self.segments])
 
     def sample(self, pixels: Float64) -> Float64:
         """(k,) ||V|| at (k, 2) pixels, bilinear, 0 outside."""

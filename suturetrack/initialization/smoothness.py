@@ -60,16 +60,15 @@ def step(one: Disparities, other: Disparities) -> float:
 def roughness(ridges: Ridges) -> float:
     """How rough the strands of a view may be where they meet: the step above what is likeliest for the
     roughest part of its clear long segments."""
-    long = [segment for segment in ridges.segments if len(segment) >= _LONG]
-    if not long:
+    sizes = np.array([len(segment) for segment in ridges.segments])
+    long = np.flatnonzero(sizes >= _LONG)
+    if not len(long):
         return ROUGHEST
-    strength = np.array([np.median(ridges.sample(segment)) for segment in long])
-    level = _CLEAR * np.average(strength, weights=[len(segment) for segment in long])
+    level = _CLEAR * np.average(ridges.strengths[long], weights=sizes[long])
     parts = [
-        segment[k : min(k + _PART, len(segment) - _SKIPPED) : _EVERY]
-        for segment, found in zip(long, strength, strict=True)
-        for k in range(_SKIPPED, len(segment) - _SKIPPED - _PART // 2, _PART)
-        if found > level
+        ridges.segments[i][k : min(k + _PART, sizes[i] - _SKIPPED) : _EVERY]
+        for i in long[ridges.strengths[long] > level]
+        for k in range(_SKIPPED, sizes[i] - _SKIPPED - _PART // 2, _PART)
     ]
     rougher = pairwise(_ROUGHNESSES)
     smooth, rough = next(rougher)
@@ -125,13 +124,13 @@ def _energy(t: Float64, values: Float64, variance: Float64, prior: _Prior) -> tu
 def _sloping(t: Float64) -> Float64:
     """(k, k) covariance of a line whose slope drifts."""
     least, gap, centred = np.minimum.outer(t, t), abs(np.subtract.outer(t, t)), t - t.mean()
-    drift = least**3 / 3 + gap * least**2 / 2
+    drift = least * least * (least / 3 + gap / 2)
     return _DISPARITY_BEND * drift + _ANYWHERE_PX**2 + np.outer(centred, centred)
 
 
 def _curving(t: Float64, roughness: float) -> Float64:
     """(k, k) covariance of a curve whose curvature drifts."""
     least, gap, centred = np.minimum.outer(t, t), abs(np.subtract.outer(t, t)), t - t.mean()
-    drift = least**5 / 20 + gap * least**4 / 8 + gap**2 * least**3 / 12
+    drift = least * least * least * (least * (least / 20 + gap / 8) + gap * gap / 12)
     bent = _ANY_CURVATURE**2 * np.outer(centred**2, centred**2)
     return roughness * drift + _ANYWHERE_PX**2 + np.outer(centred, centred) + bent

@@ -159,13 +159,9 @@ class Thread:
         segments = self.ridges.segments
         if polyline_distances(path, self.chain.pixels).max() < _ANOTHER_WAY_PX:
             return [segments[k] for k in self._others(_FAINT)]
-        level, near = _FAINT * self._strength, cKDTree(path)
-        return [
-            segment
-            for segment in segments
-            if np.median(self.ridges.sample(segment)) > level
-            and np.median(near.query(segment)[0]) > _OWN_PX
-        ]
+        clear = np.flatnonzero(self.ridges.strengths > _FAINT * self._strength)
+        near = cKDTree(path)
+        return [segments[k] for k in clear if np.median(near.query(segments[k])[0]) > _OWN_PX]
 
     def meets_another_at(self, place: Float64) -> bool:
         """Whether another strand that leads away runs as near by a pixel (2,) as the thread itself."""
@@ -210,13 +206,9 @@ class Thread:
 
     def _others(self, strength: float) -> list[int]:
         """The segments that are no part of the thread, and have that share of its strength."""
-        own, ridges = {e // 2 for e in self.entries}, self.ridges
-        level = strength * self._strength
-        return [
-            k
-            for k, segment in enumerate(ridges.segments)
-            if k not in own and np.median(ridges.sample(segment)) > level
-        ]
+        own = {e // 2 for e in self.entries}
+        clear = np.flatnonzero(self.ridges.strengths > strength * self._strength)
+        return [k for k in clear.tolist() if k not in own]
 
 
 def follow_thread(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -25,7 +24,7 @@ from suturetrack.initialization.pricing import (
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.initialization.smoothness import roughness
 from suturetrack.polylines import unit
-from suturetrack.types import Bool, Float64
+from suturetrack.types import Bool
 
 _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""
@@ -85,14 +84,14 @@ def _pair_up(ridges: Ridges, config: InitializationConfig, depth: Depth | None) 
 
 def _clear_ends(joints: Joints, ridges: Ridges) -> list[int]:
     """The free ends of strands about as strong as the strongest."""
-    is_clear = _are_clear(joints.segments, ridges)
-    return [end for end in joints.free if is_clear[end // 2]]
+    is_clear = _are_clear(ridges)
+    return [end for end in joints.free if is_clear[joints.original(end) // 2]]
 
 
-def _are_clear(segments: Sequence[Float64], ridges: Ridges) -> Bool:
+def _are_clear(ridges: Ridges) -> Bool:
     """(n,) which segments are about as strong as the strongest."""
-    strength = np.array([np.median(ridges.sample(segment)) for segment in segments])
-    is_long = np.array([len(segment) >= STRAND for segment in segments])
+    strength = ridges.strengths
+    is_long = np.array([len(segment) >= STRAND for segment in ridges.segments])
     return np.asarray(strength > _CLEAR * strength[is_long | ~is_long.any()].max())
 
 
@@ -116,7 +115,7 @@ def _divided(ridges: Ridges, joints: Joints) -> Ridges:
 def _touched(end: int, ridges: Ridges, joints: Joints) -> tuple[int, int] | None:
     """The clear segment of another strand that the end of one touches, and the point of it; None if none."""
     own = {joints.original(entry) // 2 for entry in joints.follow(end // 2)}
-    clear = np.flatnonzero(_are_clear(ridges.segments, ridges)).tolist()
+    clear = np.flatnonzero(_are_clear(ridges)).tolist()
     place = inward(joints.segments, end)[0]
     away = {k: np.linalg.norm(ridges.segments[k] - place, axis=1) for k in clear if k not in own}
     k = min(away, key=lambda k: away[k].min(), default=-1)
@@ -172,8 +171,8 @@ def _facing(ends: list[int], ridges: Ridges) -> list[Pair]:
     places = np.array([arm[0] for arm in arms])
     heading = unit(places - [arm[-1] for arm in arms])
     # Behind what hides it the ground may be another one, for all of the strand or for its last points.
-    wholes = [ridges.segments[end // 2] for end in ends]
-    strengths = np.array([[np.median(ridges.sample(p)) for p in parts] for parts in (wholes, arms)])
+    wholes = ridges.strengths[[end // 2 for end in ends]]
+    strengths = np.array([wholes, [np.median(ridges.sample(arm)) for arm in arms]])
     a, b = cKDTree(places).query_pairs(_LONGEST_HIDDEN_PX, output_type="ndarray").T
     way = places[b] - places[a]
     facing = np.minimum((heading[a] * way).sum(1), -(heading[b] * way).sum(1))
