@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 
@@ -53,11 +52,6 @@ class Arms:
         self._bends: dict[Pair, float] = {}
         self._disparities: dict[int, Disparities | None] = {}
         self._colours: dict[int, Float64] = {}
-
-    @cached_property
-    def pieces(self) -> Arms:
-        """The arms as far as the segments go by themselves, whoever may share them."""
-        return Arms(self._segments, {}, None, self._depth, self._tints, self._roughness)
 
     def with_steps(self, merges: Merges) -> Merges:
         """The merges, those dearer whose arms differ in depth or in colour."""

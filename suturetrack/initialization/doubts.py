@@ -11,7 +11,7 @@ from scipy.special import expit
 from suturetrack.initialization.arms import ENERGY
 from suturetrack.initialization.colours import Tints, difference
 from suturetrack.initialization.joints import Joints, inward
-from suturetrack.initialization.pricing import FREE_END, HIGHEST, TOUCHING_PX
+from suturetrack.initialization.pricing import FREE_END, HIGHEST
 from suturetrack.initialization.segments import ARM, Ridges, chain_tangents
 from suturetrack.polylines import nearest_index
 from suturetrack.types import Float64
@@ -58,6 +58,8 @@ _PARALLEL = 0.7
 """Cosine of the angle up to which a strand that ends on the thread runs into it."""
 _JOINS_PX = 8.0
 """How near to it such a strand ends: the thread draws its last points aside."""
+_TOUCHING_PX = 6.0
+"""Distance of an end from another one, or from a strand, up to which it touches that."""
 _CLEAR, _LEAVES_PX = 0.4, 10.0
 """Strength of a strand at the thread's side or end, against the thread there, and how far away it leads, at
 least: another thread may have another colour, and a shadow has a quarter of the strength."""
@@ -201,7 +203,7 @@ def is_beyond_gap(joints: Joints, tip: int, ridges: Ridges) -> bool:
     gap = float(np.linalg.norm(after - before))
     between = ridges.sample(np.linspace(before, after, _GAP_SAMPLES))
     is_unseen = between.min() < _UNSEEN * np.median(ridges.sample(segment))
-    return bool(is_unseen and gap > TOUCHING_PX and len(segment) < gap)
+    return bool(is_unseen and gap > _TOUCHING_PX and len(segment) < gap)
 
 
 def _meets_strand(joints: Joints, tip: int, thread: set[int], ridges: Ridges) -> bool:
@@ -209,7 +211,7 @@ def _meets_strand(joints: Joints, tip: int, thread: set[int], ridges: Ridges) ->
     segment = inward(joints.segments, tip)
     end, level = segment[0], _CLEAR * float(np.median(ridges.sample(segment)))
     for k, other in enumerate(joints.segments):
-        if k not in thread and np.linalg.norm(other - end, axis=1).min() < TOUCHING_PX:
+        if k not in thread and np.linalg.norm(other - end, axis=1).min() < _TOUCHING_PX:
             strand = _strand(joints, k, thread)
             leads_away = np.linalg.norm(strand - end, axis=1).max() > _LEAVES_PX
             if leads_away and np.median(ridges.sample(strand)) > level:

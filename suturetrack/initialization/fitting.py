@@ -21,7 +21,7 @@ _STIFFEST = 1e9
 _OFF_PX = 0.08
 """By how much the rows of two views have to be off, at least, for that to be told from the bunching of
 depth along the epipolar lines: calibrated ones seem to be off by up to 0.05."""
-_SURELY = 4.0
+_SURELY = 6.0
 """Standard deviations by which they have to seem off, at least."""
 _ANY_SLIP_PX = 1.0
 """What the rows may be off where no crest tells, px (standard deviation)."""

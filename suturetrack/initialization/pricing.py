@@ -31,8 +31,8 @@ _AT_ONCE = 4096
 STRAND, _STRAND_STRENGTH = 20, 0.5
 """Points, and strength against the average, from which a segment may be a part of a thread, and no speck
 or rim."""
-TOUCHING_PX = 6.0
-"""Ends this near over ridge belong together at any angle: a sharp bend."""
+_TOGETHER_PX = 12.0
+"""Distance up to which two ends may belong together at any angle: a sharp bend."""
 FREE_END = 0.5
 """Price of an end without a partner."""
 DEAR_END = 2.0
@@ -51,8 +51,6 @@ class Merges:
     """(m, 2)."""
     cost: Float64
     """(m,)."""
-    touching: Bool
-    """(m,) whether ridge joins the two ends, whatever their angle."""
     alike: Bool
     """(m,) whether both are near and of strands as strong as any: a thread may turn round there."""
 
@@ -63,7 +61,7 @@ class Merges:
 
     def where(self, kept: Bool) -> Merges:
         """Some of them, (m,)."""
-        return Merges(self.pairs[kept], self.cost[kept], self.touching[kept], self.alike[kept])
+        return Merges(self.pairs[kept], self.cost[kept], self.alike[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,16 +110,15 @@ def price_merges(ridges: Ridges, config: InitializationConfig) -> Merges:
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
     i, j = pairs.T
     distance = np.linalg.norm(positions[j] - positions[i], axis=1)
-    shape, weakest = _bridge_prices(tips, pairs, ridges, config)
-    hooked = np.flatnonzero((shape > FREE_END) & (distance < 2 * TOUCHING_PX))
-    others, _ = _bridge_prices(_Tips.of(ridges.segments, _HOOKED), pairs[hooked], ridges, config)
+    shape = _bridge_prices(tips, pairs, ridges, config)
+    hooked = np.flatnonzero((shape > FREE_END) & (distance < _TOGETHER_PX))
+    others = _bridge_prices(_Tips.of(ridges.segments, _HOOKED), pairs[hooked], ridges, config)
     shape[hooked] = np.minimum(shape[hooked], others)
     ratio = np.minimum(*(abs(np.log(s[i] / s[j])) for s in (near, whole)))
     cost = shape + 0.25 * ratio**2 + _SHORT * np.maximum(short[i], short[j])
-    touching = (distance < TOUCHING_PX) & (weakest >= config.low)
     is_strand = (size >= STRAND) & (whole > _STRAND_STRENGTH * np.average(whole, weights=size))
-    alike = (distance < 2 * TOUCHING_PX) & is_strand[i] & is_strand[j]
-    return Merges(pairs, cost, touching, alike)
+    alike = (distance < _TOGETHER_PX) & is_strand[i] & is_strand[j]
+    return Merges(pairs, cost, alike)
 
 
 def _tip(segment: Float64, clear: int) -> Float64:
@@ -133,23 +130,21 @@ def _tip(segment: Float64, clear: int) -> Float64:
 
 def _bridge_prices(
     tips: _Tips, pairs: Int64, ridges: Ridges, config: InitializationConfig
-) -> tuple[Float64, Float64]:
-    """What smooth curves through (m, 2) pairs of tips cost by their shape and the ridge below them,
-    and the least ||V|| between the tips, each (m,)."""
+) -> Float64:
+    """(m,) what smooth curves through (m, 2) pairs of tips cost by their shape and the ridge below them."""
     parts = np.array_split(pairs, len(pairs) // _AT_ONCE + 1)
-    found = [_bridge_price(tips[p[:, 0]], tips[p[:, 1]], ridges, config) for p in parts]
-    price, weakest = zip(*found, strict=True)
-    return np.concatenate(price), np.concatenate(weakest)
+    return np.concatenate(
+        [_bridge_price(tips[p[:, 0]], tips[p[:, 1]], ridges, config) for p in parts]
+    )
 
 
 def _bridge_price(
     one: _Tips, other: _Tips, ridges: Ridges, config: InitializationConfig
-) -> tuple[Float64, Float64]:
+) -> Float64:
     misfit, swing, bridge = _common_curves(one, other)
     distance = np.linalg.norm(other.points[:, 0] - one.points[:, 0], axis=1)
-    seen, weakest = _evidence(ridges, bridge, config)
-    missing = (1 - seen) * distance / config.gap_px
-    return misfit + _SWING * swing**2 + missing + 0.1 * distance / config.gap_px, weakest
+    missing = (1 - _evidence(ridges, bridge, config)) * distance / config.gap_px
+    return misfit + _SWING * swing**2 + missing + 0.1 * distance / config.gap_px
 
 
 def _common_curves(one: _Tips, other: _Tips) -> tuple[Float64, Float64, Float64]:
@@ -177,12 +172,9 @@ def _powers(t: Float64) -> Float64:
     return np.stack([t**3, t**2, t, np.ones_like(t)], axis=-1)
 
 
-def _evidence(
-    ridges: Ridges, bridges: Float64, config: InitializationConfig
-) -> tuple[Float64, Float64]:
-    """Share of each of (m, k, 2) bridges that is on ridge of its direction, and the least ||V||."""
+def _evidence(ridges: Ridges, bridges: Float64, config: InitializationConfig) -> Float64:
+    """(m,) share of each of (m, k, 2) bridges that is on ridge of its direction."""
     tangents = unit(np.gradient(bridges, axis=1))
     flat = bridges.reshape(-1, 2)
     along = search.responses(ridges.field, flat, tangents.reshape(-1, 2))
-    share = np.clip(along.reshape(bridges.shape[:2]) / config.high, 0, 1).mean(1)
-    return share, ridges.sample(flat).reshape(bridges.shape[:2]).min(1)
+    return np.asarray(np.clip(along.reshape(bridges.shape[:2]) / config.high, 0, 1).mean(1))

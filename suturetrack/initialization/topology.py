@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
-from suturetrack.initialization.arms import REACH, Arms
+from suturetrack.initialization.arms import Arms
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.hairpins import double_stubs
@@ -30,8 +30,6 @@ _LONGEST_RUN = 4
 """Segments that two strands may share in a row."""
 _LONG_PX, _WIDER = 100, 1.1
 """Length from which such a segment has to be wider than those of the view are, and by how much, squared."""
-_CLEARLY = 0.03
-"""By how much less two strands have to cost in all if their far parts are swapped."""
 _BENT = 8.0
 """Energy by which two arms fit together less well as one strand than as two."""
 _LONGEST_HIDDEN_PX = 60.0
@@ -129,16 +127,12 @@ def _merge(ridges: Ridges, merges: Merges, arms: Arms | None, free_end: float = 
     order = np.argsort(merges.cost)
     joints.join_free(merges.pairs[order[merges.cost[order] < joints.highest]])
     joints.exchange()
-    if arms is not None:
-        _uncross(joints, arms)
     _share(joints, ridges, arms)
     joints.open_rings()
     double_stubs(joints)
-    joints.join_free(merges.pairs[order[merges.touching[order]]])
     if arms is not None:
         _mark_bent(joints, arms)
         _bridge_hidden(joints, ridges, arms)
-        _lead_beside(joints, arms.pieces)
     return joints
 
 
@@ -180,33 +174,6 @@ def _facing(ends: list[int], ridges: Ridges) -> list[Pair]:
     least, most = _AS_STRONG * strengths.min(0), strengths.max(0)
     is_pair &= (most[a] > least[b]) & (most[b] > least[a])
     return [(ends[i], ends[j]) for i, j in zip(a[is_pair], b[is_pair], strict=True)]
-
-
-def _uncross(joints: Joints, arms: Arms) -> None:
-    """Where one strand leads through a short segment and another beside it, swaps their far parts if
-    these fit better so: short segments say little about direction."""
-    within, partner, price = joints.within_reach(), joints.partner, joints.price
-    for k, segment in enumerate(joints.segments):
-        start, stop = 2 * k, 2 * k + 1
-        if len(segment) >= REACH or start not in partner or stop not in partner:
-            continue
-        a, b = partner[start], partner[stop]
-        for c in within.get(start, ()):
-            d = partner.get(c, -1)
-            if c in (a, b) or d in (a, b, start, stop) or d not in within.get(stop, ()):
-                continue
-            change = arms.change([(a, b), (c, d)], [(a, d), (c, b)])
-            if change is None:
-                continue
-            ways = [
-                (price[stop, d] + joints.price_of((c, b)) - price[stop, b], (stop, d), (c, b)),
-                (price[start, c] + joints.price_of((a, d)) - price[start, a], (start, c), (a, d)),
-            ]
-            added, *pairs = min(ways)
-            if added - price[c, d] + change < -_CLEARLY:
-                for pair in pairs:
-                    joints.join(*pair, FREE_END)
-                break
 
 
 def _share(joints: Joints, ridges: Ridges, arms: Arms | None) -> None:
@@ -289,20 +256,3 @@ def _change(joints: Joints, taken: list[Pair], exchanged: list[Pair], arms: Arms
         [(joints.original(i), joints.original(j)) for i, j in way] for way in (taken, exchanged)
     )
     return arms.change(*ways)
-
-
-def _lead_beside(joints: Joints, pieces: Arms) -> None:
-    """The leads of strands that pass beside a short segment of another strand, which they touch."""
-    within, lead = joints.within_reach(), dict[int, float]()
-    for a, b in joints.partner.items():
-        for near in within.get(a, ()):
-            far = near ^ 1
-            if far not in within.get(b, ()) or len(joints.segments[near // 2]) >= REACH:
-                continue
-            c, d = joints.partner.get(near, b), joints.partner.get(far, a)
-            if len({a, b, c, d} - {near, far}) < 4:
-                continue
-            change = _change(joints, [(a, b), (c, d)], [(a, d), (c, b)], pieces)
-            if change is not None:
-                lead[a] = lead[b] = min(change, lead.get(a, np.inf))
-    joints.lead |= lead
