@@ -518,6 +518,17 @@ def test_any_seed_near_the_thread_teaches(
     assert np.mean(centre_errors(field, pixels[5:-5]) > 1) < 0.02
 
 
+@pytest.mark.parametrize("brightness", [0.15, 0.08, 0.04])
+def test_a_dark_picture_teaches_as_a_bright_one_does(scene: Scene, brightness: float) -> None:
+    pixels = thread_pixels(scene)
+    left, right = ((brightness * image).astype(np.uint8) for image in scene.render(0))
+    segmenter, frame = Segmenter(scene.rig), StereoFrame(STAMP, left, right)
+    u, v = pixels[len(pixels) // 2]
+    segmenter.learn(frame, Seed(pixel=(u, v)))
+    assert not segmenter.unlearned
+    assert np.mean(centre_errors(segmenter.step(frame).left, pixels[5:-5]) > 1) < 0.03
+
+
 def test_a_point_teaches_as_its_pixel_does(scene: Scene) -> None:
     points = scene.truth(0)[0].points
     point = points[len(points) // 2]

@@ -43,8 +43,9 @@ _ROUNDS = 2
 _SHORTEST_PX = 20
 # Threads stand out from the clutter by 2.1 to 6.6 (median 4), textures by up to 2.2 (median 0.5).
 _LEAST_SCORE = 1.9
-# Variance of the second derivatives that even a flawless picture is taken to have, grey levels^2.
-_FLOOR = 1.0
+# Variance of the second derivatives that even a flawless picture is taken to have, grey levels^2, and the
+# brightness below which one has less in which nothing stands out from that.
+_FLOOR, _BRIGHT = 1.0, 70.0
 # Second derivative across the edge of a shadow, as a share of the brightness.
 _SHADOW = 0.05
 # Scales that show the thread by less than this share of the clearest one are too small or too large.
@@ -134,7 +135,16 @@ def contrast_at(image: Image, pixel: Float64) -> Contrast | None:
         image: (H, W, 3) BGR or (H, W) gray, uint8.
         pixel: (2,) in that image.
     """
-    shown = [_shown(image, pixel, octave) for octave in range(len(SIGMAS))]
+    contrast = _contrast_at(image, pixel, _FLOOR)
+    brightness = max(float(_window(image, pixel)[0].mean((0, 1)).max()), 1.0)
+    if contrast is None and brightness < _BRIGHT:
+        return _contrast_at(image, pixel, _FLOOR * (brightness / _BRIGHT) ** 2)
+    return contrast
+
+
+def _contrast_at(image: Image, pixel: Float64, floor: float) -> Contrast | None:
+    """As `contrast_at`, in a picture whose second derivatives have that variance at least."""
+    shown = [_shown(image, pixel, octave, floor) for octave in range(len(SIGMAS))]
     found = [s for s in shown if s is not None and s.score >= _LEAST_SCORE]
     if not found:
         return None
@@ -150,7 +160,7 @@ def contrast_at(image: Image, pixel: Float64) -> Contrast | None:
     if best.octave:
         octave, sigma, zoom = best.octave - 1, _BELOW * SIGMAS[1], 2
     crop, seed = _window(*_shrunk(image, pixel, octave), zoom * _WINDOW_PX)
-    scene = _Scene.of(crop, sigma)
+    scene = _Scene.of(crop, sigma, floor)
     ridge = _Ridge(zoom * best.ridge.pixels + seed, best.ridge.normals)
     across = _of_one_thread(scene, ridge, seed)
     clutter = scene.clutter_near(seed, zoom * _NEAR_PX)
@@ -162,7 +172,7 @@ def _shown_at(times: int, image: Image, ridge: _Ridge, scene: _Scene) -> float:
     """How much of a ridge in a scene of the image a scale shows that is so many times wider."""
     own, wide = (
         np.median(ridge.across(seen), axis=0)
-        for seen in (scene, _Scene.of(image, times * scene.sigma))
+        for seen in (scene, _Scene.of(image, times * scene.sigma, scene.floor))
     )
     return float(wide @ own / (own @ own))
 
@@ -179,7 +189,7 @@ def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
     across, clutter = [], []
     for i in np.linspace(0, len(pixels) - 1, min(_WINDOWS, len(pixels))).round().astype(int):
         crop, centre = _window(image, pixels[i], _HALF_PX)
-        scene = _Scene.of(crop, sigma)
+        scene = _Scene.of(crop, sigma, _FLOOR)
         # At the rim of the window, the filter would look beyond it.
         near = np.abs(pixels - pixels[i]).max(1) <= _HALF_PX - 3 * sigma
         ridge = _Ridge(pixels[near] - pixels[i] + centre, normals[near])
@@ -202,10 +212,10 @@ class _Shown:
     """Length of the second derivative across, over the channels."""
 
 
-def _shown(image: Image, pixel: Float64, octave: int) -> _Shown | None:
+def _shown(image: Image, pixel: Float64, octave: int, floor: float) -> _Shown | None:
     """The ridge that stands out most near the seed, in the image halved `octave` times."""
     crop, seed = _window(*_shrunk(image, pixel, octave))
-    scene = _Scene.of(crop, SIGMAS[0])
+    scene = _Scene.of(crop, SIGMAS[0], floor)
     reach = max(_SNAP_PX / 2**octave, _LEAST_SNAP_PX)
 
     def standing(weights: Float64, ridge: _Ridge) -> float:
@@ -243,9 +253,11 @@ class _Scene:
     nuisance: Float64
     """(channels, channels): the clutter and, whether the image shows one or not, a shadow."""
     sigma: float
+    floor: float
+    """Of the variances in them, grey levels^2."""
 
     @classmethod
-    def of(cls, image: Image, sigma: float) -> _Scene:
+    def of(cls, image: Image, sigma: float, floor: float) -> _Scene:
         planes = np.atleast_3d(image).astype(np.float64)
         smooth, slope, curve = gaussian_taps(sigma).astype(np.float64)
         smooth, curve = np.r_[smooth[:0:-1], smooth], np.r_[curve[:0:-1], curve]
@@ -256,15 +268,15 @@ class _Scene:
                 for taps in ((curve, smooth), (slope, slope), (smooth, curve))
             ]
         ).reshape(3, *planes.shape)
-        clutter = _scatter(hessian)
+        clutter = _scatter(hessian, floor)
         shadow = _SHADOW * planes.mean((0, 1))
-        return cls(hessian, clutter, clutter + np.outer(shadow, shadow), sigma)
+        return cls(hessian, clutter, clutter + np.outer(shadow, shadow), sigma, floor)
 
     def clutter_near(self, pixel: Float64, half: int) -> Float64:
         """(channels, channels): the clutter in a window around a pixel."""
         u, v = np.rint(pixel).astype(int)
         near = slice(max(v - half, 0), v + half), slice(max(u - half, 0), u + half)
-        return _scatter(self.hessian[:, *near])
+        return _scatter(self.hessian[:, *near], self.floor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,11 +298,11 @@ class _Ridge:
         return nu * nu * uu + 2 * nu * nv * uv + nv * nv * vv
 
 
-def _scatter(hessian: Float64) -> Float64:
-    """(channels, channels): the covariance of second derivatives, (3, H, W, channels)."""
+def _scatter(hessian: Float64, floor: float) -> Float64:
+    """(channels, channels): the covariance of second derivatives, (3, H, W, channels), with a floor."""
     uu, uv, vv = hessian.reshape(3, -1, hessian.shape[-1])
     scatter = (uu.T @ uu + 2 * uv.T @ uv + vv.T @ vv) / (2 * len(uu))
-    return np.asarray(scatter + _FLOOR * np.eye(len(scatter)))
+    return np.asarray(scatter + floor * np.eye(len(scatter)))
 
 
 def _window(image: Image, pixel: Float64, half: int = _WINDOW_PX) -> tuple[Image, Float64]:
