@@ -57,7 +57,7 @@ def test_a_step_in_depth_makes_a_merge_dearer(
 ) -> None:
     arms = crossing()
     left, right = two_views(arms, [DISPARITY, *(DISPARITY + s for s in steps)], rig)
-    merges = Merges(np.array([[0, 2], [0, 4]]), np.array([0.3, 0.3]), *np.zeros((2, 2), bool))
+    merges = Merges(np.array([[0, 2], [0, 4]]), np.array([0.3, 0.3]), np.zeros(2, bool))
     depth = Depth.around(np.full(10, DISPARITY), left, right)
     cost = Arms(tuple(arms), {}, merges, depth, None).with_steps(merges).cost
     assert cost[dearer] > cost[1 - dearer] + 0.2
@@ -70,7 +70,7 @@ def test_a_step_in_depth_makes_a_merge_dearer(
 def test_strands_that_cross_go_straight_on() -> None:
     run = np.arange(8.0, 69.0)
     ends = [np.c_[300 + way * run, 200 + side * 0.7 * run] for way in (-1, 1) for side in (-1, 1)]
-    merges = Merges(np.empty((0, 2), np.int64), np.empty(0), *np.empty((2, 0), bool))
+    merges = Merges(np.empty((0, 2), np.int64), np.empty(0), np.empty(0, bool))
     crossing_arms = Arms(tuple(ends), {}, merges, None, None)
     straight, touching = [(0, 6), (2, 4)], [(0, 4), (2, 6)]
     change = crossing_arms.change(straight, touching)
@@ -113,7 +113,7 @@ def test_a_merge_that_leaves_a_piece_out_is_no_rival() -> None:
     pieces = strand[:24], strand[25:35], strand[36:]
     # Two strands may come before its first piece; its last piece would be joined to that about as well.
     pairs, costs = np.array([[0, 6], [0, 8], [1, 2], [3, 4], [1, 4]]), [0.2, 0.25, 0.1, 0.1, 0.15]
-    merges = Merges(pairs, np.array(costs), *np.zeros((2, 5), bool))
+    merges = Merges(pairs, np.array(costs), np.zeros(5, bool))
     arms = Arms([*pieces, *before], {1: 2, 2: 1, 3: 4, 4: 3}, merges, None, None)
     assert arms.change([(0, 6)], [(0, 8)]) is not None
     apart = Arms([*pieces, *before], {3: 4, 4: 3}, merges, None, None)
