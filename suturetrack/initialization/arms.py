@@ -40,14 +40,14 @@ class Arms:
         self,
         segments: Sequence[Float64],
         partner: dict[int, int],
-        merges: Merges | None,
+        merges: Merges,
         depth: Depth | None,
         tints: Tints | None,
         roughness: float = ROUGHEST,
     ) -> None:
         self._segments, self._partner, self._depth = segments, partner, depth
         self._tints, self._roughness = tints, roughness
-        self._leads = {} if merges is None else _leads(merges, partner)
+        self._leads = _leads(merges, partner)
         self._arms: dict[int, Float64] = {}
         self._bends: dict[Pair, float] = {}
         self._disparities: dict[int, Disparities | None] = {}

@@ -39,7 +39,7 @@ class Joints:
     hidden: set[int] = field(default_factory=set)
     """The joined ends of strands that something hides in between."""
     lead: dict[int, float] = field(default_factory=dict)
-    """Of ends at which two strands part that touched: by how much the ways that they take cost less than
+    """Of ends at which two strands leave what they share: by how much the ways that they take cost less than
     exchanged, by their arms."""
     _copied: dict[int, int] = field(default_factory=dict)
     """Which segment each copy is of."""

@@ -159,9 +159,12 @@ class Thread:
         segments = self.ridges.segments
         if polyline_distances(path, self.chain.pixels).max() < _ANOTHER_WAY_PX:
             return [segments[k] for k in self._others(_FAINT)]
-        clear = np.flatnonzero(self.ridges.strengths > _FAINT * self._strength)
         near = cKDTree(path)
-        return [segments[k] for k in clear if np.median(near.query(segments[k])[0]) > _OWN_PX]
+        return [
+            segments[k]
+            for k in self._as_strong(_FAINT)
+            if np.median(near.query(segments[k])[0]) > _OWN_PX
+        ]
 
     def meets_another_at(self, place: Float64) -> bool:
         """Whether another strand that leads away runs as near by a pixel (2,) as the thread itself."""
@@ -207,8 +210,11 @@ class Thread:
     def _others(self, strength: float) -> list[int]:
         """The segments that are no part of the thread, and have that share of its strength."""
         own = {e // 2 for e in self.entries}
-        clear = np.flatnonzero(self.ridges.strengths > strength * self._strength)
-        return [k for k in clear.tolist() if k not in own]
+        return [k for k in self._as_strong(strength) if k not in own]
+
+    def _as_strong(self, strength: float) -> list[int]:
+        """The segments that have that share of its strength."""
+        return np.flatnonzero(self.ridges.strengths > strength * self._strength).tolist()
 
 
 def follow_thread(

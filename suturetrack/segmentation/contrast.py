@@ -136,10 +136,12 @@ def contrast_at(image: Image, pixel: Float64) -> Contrast | None:
         pixel: (2,) in that image.
     """
     contrast = _contrast_at(image, pixel, _FLOOR)
+    if contrast is not None:
+        return contrast
     brightness = max(float(_window(image, pixel)[0].mean((0, 1)).max()), 1.0)
-    if contrast is None and brightness < _BRIGHT:
-        return _contrast_at(image, pixel, _FLOOR * (brightness / _BRIGHT) ** 2)
-    return contrast
+    if brightness >= _BRIGHT:
+        return None
+    return _contrast_at(image, pixel, _FLOOR * (brightness / _BRIGHT) ** 2)
 
 
 def _contrast_at(image: Image, pixel: Float64, floor: float) -> Contrast | None:
