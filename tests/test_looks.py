@@ -501,6 +501,28 @@ def test_a_part_of_what_was_sure_does_not_take_its_place(
     assert rms(states[-1], truths[-1]) < 0.1
 
 
+@pytest.mark.parametrize(("shown_at", "is_taken_up"), [(8, True), (40, True), (-45, False)])
+def test_what_comes_into_sight_beyond_an_end_is_taken_up_unless_the_length_was_steady(
+    rig: StereoRig, shown_at: int, is_taken_up: bool
+) -> None:
+    """A tool draws back along the thread, or stays where it is (below 0), and goes; or another comes."""
+    steps = range(75) if shown_at > 0 else [0] * 75
+    shares = [0.4 + 0.006 * k if i < abs(shown_at) else 1.0 for i, k in enumerate(steps)]
+    truths = [thread(i / FPS)[: round(600 * share) + 1] for i, share in enumerate(shares)]
+    tracker = Tracker(rig)
+    tracker.seed(seed_at(rig, truths[0][120]))
+    states = [tracker.step(paint(rig, [p], i)).states[0] for i, p in enumerate(truths)]
+    further = [i for i, state in enumerate(states) if "found further on" in state.events]
+    if not is_taken_up:
+        assert not further
+        assert max(state.length for state in states) < 60.0
+        return
+    assert shown_at < further[0] < shown_at + FPS // 2
+    for state, points in zip(states[further[0] :], truths[further[0] :], strict=True):
+        assert state.status is Status.TRACKING
+        assert rms(state, points) < 0.15
+
+
 @pytest.mark.parametrize("is_clear_once", [True, False])
 def test_places_that_are_clear_in_one_look_each_are_sure_together(
     rig: StereoRig, is_clear_once: bool

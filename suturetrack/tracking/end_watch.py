@@ -24,6 +24,8 @@ _SETTLED_S = 0.7
 # One whose mean of late has kept so near to the mean of long for so long does not change at all: one that is
 # drawn out slowly does.
 _CONSTANT, _CONSTANT_S = 0.002, 1.0
+# How long an end shows further on, without a break, until somebody should look.
+_ASKS_S = 0.15
 # How soon it is forgotten that a thread was longer, and that an end has gone on.
 _FORGOTTEN_S = 3.0
 _NS = 1e-9
@@ -54,6 +56,10 @@ class EndWatch:
         self.length = self._longest = self._steady = self._recent = length
         self._before = before
         self._is_known = False
+        self._plain_ns = now_ns
+        """When neither end was held that showed further on."""
+        self.shows_more = False
+        """Whether an end that is held has shown further on for a while."""
         self._gone_on = [0.0, 0.0]
         """By how much the ends have gone on of late."""
         self.settled = False
@@ -88,6 +94,9 @@ class EndWatch:
         self.wanted = length * (1.0 + sum(believed))
         doubted = self._doubted(steps, offsets, length, now_ns)
         seen = [end not in doubted for end in (0, 1)]
+        if not any(_leaps(steps[end]) for end in doubted):
+            self._plain_ns = now_ns
+        self.shows_more = (now_ns - self._plain_ns) * _NS > _ASKS_S
         for end in doubted:
             offsets[end] = self._held(end, steps[end], offsets[1 - end], length, seen[1 - end])
         for end in (0, 1):
@@ -175,6 +184,11 @@ class EndWatch:
     def _fading(self, now_ns: int) -> float:
         """What is left of what was remembered at the last field."""
         return math.exp(-max(now_ns - self._last_ns, 0) * _NS / _FORGOTTEN_S)
+
+
+def _leaps(step: EndStep | None) -> bool:
+    """Whether an end shows further on, by itself, than a thread is drawn out."""
+    return step is not None and step.alone and step.offset_px > _LEAP_PX
 
 
 def _growth_px(step: EndStep) -> float:

@@ -14,6 +14,7 @@ from suturetrack.tracking.overlaps import doubting_ends, known_as, lies_on, mean
 from suturetrack.tracking.pursuit import Pursuit
 from suturetrack.tracking.recovery import Setup, directed, find_again, find_elsewhere, starts_on
 from suturetrack.tracking.strands import Neighbours
+from suturetrack.tracking.sureness import SINGLE
 from suturetrack.types import InputError, Nurbs, RidgeField, Seed
 
 Found = Initialization | InitializationError | None
@@ -124,6 +125,38 @@ class Closer:
         return Pursuit(found, field, self.seed, self.setup, before)
 
 
+@dataclass(frozen=True, eq=False)
+class Further:
+    """A look at a thread that is followed for sure, but goes on where an end of it is held."""
+
+    seed: Seed
+    """On the curve."""
+    setup: Setup
+    followed: Nurbs
+    """Where it is followed."""
+    before: tuple[Follower, ...]
+    """Who has followed it."""
+
+    def find(self, field: RidgeField) -> Found:
+        """A thread that is longer than the one that is followed ever was."""
+        try:
+            found = self.setup.look(field, self.seed)
+        except (InitializationError, InputError):  # The place may have left the image.
+            return None
+        if found.confidence < SINGLE or has_length(found.curve, lengths(self.before)):
+            return None
+        return directed(found, self.followed)
+
+    def beside(self, others: Neighbours, found: Initialization) -> Found:
+        """What was found, unless it is one of the other threads."""
+        return _none_of(others, found, self.setup.rig_of(found))
+
+    def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
+        """Follows what this look found."""
+        before = _who_knew(found.curve, self.before)
+        return Pursuit(found, field, self.seed, self.setup, before)
+
+
 def _none_of(others: Neighbours, found: Initialization, rig: StereoRig) -> Initialization | None:
     surer = others.as_sure_as(found.confidence)
     if known_as(found, others, rig) or lies_on(found.curve, surer, rig):
@@ -131,7 +164,7 @@ def _none_of(others: Neighbours, found: Initialization, rig: StereoRig) -> Initi
     return doubting_ends(found, others, rig)
 
 
-Search = FromSeed | Again | Closer
+Search = FromSeed | Again | Closer | Further
 
 
 def lengths(followers: tuple[Follower, ...]) -> tuple[float, ...]:

@@ -15,7 +15,8 @@ from suturetrack.types import Float64, Nurbs
 SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
 # And that of one that needs no other: the first one, and one after looks that were in doubt.
-_AT_ONCE, _SINGLE = 0.75, 0.9
+_AT_ONCE = 0.75
+SINGLE = 0.9
 # Votes that make a curve sure, if no doubt stays: of a sure look one, and half of one of others; and of one
 # that was looked at often, against the number of looks.
 _ENOUGH, _OFTEN_ENOUGH = 1.5, 0.3
@@ -139,7 +140,7 @@ class Sureness:
         if is_outvoted:
             self._begin(found, -self._votes)
             self._is_revoked = False
-        self.is_sure = is_outvoted and found.confidence >= _SINGLE
+        self.is_sure = is_outvoted and found.confidence >= SINGLE
         self._shape = self._outline(found.curve if is_outvoted else followed)
         return is_outvoted
 
@@ -168,6 +169,11 @@ class Sureness:
         there, here = self._lines(found)[0], self._lines(followed)[0]
         return bool(np.mean(polyline_distances(here, there) < _SAME_PX) < _LITTLE)
 
+    def is_part(self, followed: Nurbs, found: Nurbs) -> bool:
+        """Whether all of what is followed is a part of what was found."""
+        both = zip(self._lines(found), self._lines(followed), strict=True)
+        return all(polyline_distances(part, whole).max() < _SAME_PX for whole, part in both)
+
     def lacks_more(self, found: Nurbs, followed: Nurbs) -> bool:
         """Whether what was found is a part of what is followed, and lacks more than a little."""
         if length_of(found) > (1 - _LACKING) * length_of(followed):
@@ -195,7 +201,7 @@ class Sureness:
         enough = max(_ENOUGH, _OFTEN_ENOUGH * self._looks)
         is_enough = self._votes >= enough and remaining(self._doubts) >= SURE
         is_known = self._known_length is not None and has_length(found.curve, (self._known_length,))
-        self.is_sure = is_enough or found.confidence >= (SURE if is_known else _SINGLE)
+        self.is_sure = is_enough or found.confidence >= (SURE if is_known else SINGLE)
 
     def _is_accused(self, curve: Nurbs) -> bool:
         """Whether it is a curve that was revoked, and has not moved."""

@@ -20,7 +20,8 @@ from suturetrack.tracking.overlaps import doubting_ends
 from suturetrack.tracking.pursuit import Pursuit
 from suturetrack.tracking.recovery import Setup
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
-from suturetrack.tracking.searches import Again, Closer, FromSeed, Search, lengths
+from suturetrack.tracking.sampling import length_of
+from suturetrack.tracking.searches import Again, Closer, FromSeed, Further, Search, lengths
 from suturetrack.tracking.springs import sprung_in_depth
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.tracking.strangers import Strangers
@@ -41,6 +42,8 @@ _LOOKS = 2
 _STUB = 0.5
 # The pause between looks at a curve that other ridges may draw aside.
 _PAUSE_NS = 500_000_000
+# And at one that shows further on.
+_FURTHER_NS = 250_000_000
 FOUND, GIVEN_UP = "found", "given up"
 """Events of what came of a seed."""
 _NOWHERE = np.full(RELIABILITY_SAMPLES, np.inf)
@@ -225,9 +228,21 @@ class Thread:
         curve = self.follower.model.curve
         is_due = self._may_be_aside and now_ns - self.looked_ns >= _PAUSE_NS
         if not (is_due or self._sureness.asks_for_look(curve, now_ns)):
-            return None
+            return self._search_further(now_ns)
         before = self._who_knows_its_length() if self._looks_in_vain < _LOOKS else ()
         return Closer(self._place_to_look_from(curve), self._setup, curve, before)
+
+    def _search_further(self, now_ns: int) -> Search | None:
+        """A thread whose length was never steady has been found in part only, maybe."""
+        assert self.follower is not None
+        held = self.follower
+        curve, ends = held.model.curve, held.model.ends
+        if held.known_length.was_established or not ends.shows_more:
+            return None
+        if now_ns - self.looked_ns < _FURTHER_NS:
+            return None
+        place = self._place_to_look_from(curve)
+        return Further(place, self._setup, curve, (copy.copy(held),))
 
     def _who_knows_its_length(self) -> tuple[Follower, ...]:
         """Who follows the thread, and who did when that was sure last: another curve may have been taken
@@ -256,6 +271,8 @@ class Thread:
             self._looks_in_vain += isinstance(search, Closer) and not self._is_sure
         elif isinstance(search, Again):
             self._take_again(outcome, search.known_lengths)
+        elif isinstance(search, Further):
+            self._take_further(search, outcome)
         else:
             self._take_closer(search, outcome)
         return not was_sure or self._pursuit is not before
@@ -356,6 +373,16 @@ class Thread:
             self._come_to(
                 replace(self._followed, events=("found for sure", *self._followed.events))
             )
+
+    def _take_further(self, search: Further, outcome: Outcome) -> None:
+        assert isinstance(outcome.found, Initialization)
+        assert self._sureness is not None
+        found, state = outcome.found, outcome.state
+        if state is None or state.status is not Status.TRACKING or state.curve is None:
+            return
+        is_longer = length_of(found.curve) > length_of(search.followed)
+        if is_longer and self._sureness.is_part(search.followed, found.curve):
+            self._hold(outcome, "found further on")
 
     def _hold(
         self,
