@@ -1,4 +1,4 @@
-"""The three ways in which a thread is looked for; none depends on what changes meanwhile."""
+"""The ways in which a thread is looked for; none depends on what changes meanwhile."""
 
 from __future__ import annotations
 
@@ -111,9 +111,10 @@ class Closer:
             found = self.setup.look(field, self.seed)
         except (InitializationError, InputError):  # The place may have left the image.
             return None
-        if not has_length(found.curve, lengths(self.before)):
-            return None
-        return directed(found, self.followed)
+        return directed(found, self.followed) if self._may_be(found) else None
+
+    def _may_be(self, found: Initialization) -> bool:
+        return has_length(found.curve, lengths(self.before))
 
     def beside(self, others: Neighbours, found: Initialization) -> Found:
         """What was found, unless it is one of the other threads."""
@@ -126,35 +127,12 @@ class Closer:
 
 
 @dataclass(frozen=True, eq=False)
-class Further:
-    """A look at a thread that is followed for sure, but goes on where an end of it is held."""
+class Further(Closer):
+    """A look at a thread that is followed for sure, but shows beyond an end: it has another length, and
+    nothing else tells that it is the thread."""
 
-    seed: Seed
-    """On the curve."""
-    setup: Setup
-    followed: Nurbs
-    """Where it is followed."""
-    before: tuple[Follower, ...]
-    """Who has followed it."""
-
-    def find(self, field: RidgeField) -> Found:
-        """A thread that is longer than the one that is followed ever was."""
-        try:
-            found = self.setup.look(field, self.seed)
-        except (InitializationError, InputError):  # The place may have left the image.
-            return None
-        if found.confidence < SINGLE or has_length(found.curve, lengths(self.before)):
-            return None
-        return directed(found, self.followed)
-
-    def beside(self, others: Neighbours, found: Initialization) -> Found:
-        """What was found, unless it is one of the other threads."""
-        return _none_of(others, found, self.setup.rig_of(found))
-
-    def pursue(self, found: Initialization, field: RidgeField) -> Pursuit:
-        """Follows what this look found."""
-        before = _who_knew(found.curve, self.before)
-        return Pursuit(found, field, self.seed, self.setup, before)
+    def _may_be(self, found: Initialization) -> bool:
+        return found.confidence >= SINGLE and not super()._may_be(found)
 
 
 def _none_of(others: Neighbours, found: Initialization, rig: StereoRig) -> Initialization | None:
@@ -164,7 +142,7 @@ def _none_of(others: Neighbours, found: Initialization, rig: StereoRig) -> Initi
     return doubting_ends(found, others, rig)
 
 
-Search = FromSeed | Again | Closer | Further
+Search = FromSeed | Again | Closer
 
 
 def lengths(followers: tuple[Follower, ...]) -> tuple[float, ...]:

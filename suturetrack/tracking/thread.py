@@ -233,13 +233,12 @@ class Thread:
         return Closer(self._place_to_look_from(curve), self._setup, curve, before)
 
     def _search_further(self, now_ns: int) -> Search | None:
-        """A thread whose length was never steady has been found in part only, maybe."""
+        """Of a thread whose length was never steady only a part may have been found."""
         assert self.follower is not None
         held = self.follower
         curve, ends = held.model.curve, held.model.ends
-        if held.known_length.was_established or not ends.shows_more:
-            return None
-        if now_ns - self.looked_ns < _FURTHER_NS:
+        may_be_part = self._is_sure and not held.known_length.was_established
+        if not (may_be_part and ends.shows_more) or now_ns - self.looked_ns < _FURTHER_NS:
             return None
         place = self._place_to_look_from(curve)
         return Further(place, self._setup, curve, (copy.copy(held),))

@@ -12,7 +12,7 @@ from suturetrack.tracking.clock import StreamClock
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.looks import Look
 from suturetrack.tracking.recovery import Setup
-from suturetrack.tracking.searches import Again, Closer, FromSeed, Further
+from suturetrack.tracking.searches import Again, Closer, FromSeed
 from suturetrack.tracking.strands import Neighbour, Neighbours
 from suturetrack.tracking.thread import Thread, not_found
 from suturetrack.types import RidgeField, Seed, Stamp, ThreadState
@@ -146,9 +146,7 @@ class Tracker:
             is_beside = bool(held - {thread.name})
             # A look at what is followed holds no recovery up.
             is_urgent = thread.is_astray and not is_beside
-            is_free = self._look is None or (
-                is_urgent and isinstance(self._look.search, Closer | Further)
-            )
+            is_free = self._look is None or (is_urgent and isinstance(self._look.search, Closer))
             search = thread.search(field.stamp.capture_ns, is_beside) if is_free else None
             if search is None:
                 continue
