@@ -592,6 +592,17 @@ def test_a_wide_thread_gets_a_wide_filter() -> None:
         assert lowest <= contrast.sigma <= highest
 
 
+@pytest.mark.parametrize("away", [16, 18])
+def test_a_seed_teaches_a_thread_and_not_the_tool_beside_it(away: int) -> None:
+    thread = 150.0 - line_image(0.2, 2.0, size=641)
+    tool = np.roll(150.0 - line_image(0.2, 16.0, size=641), away, axis=0)
+    image = np.rint(150 - 0.3 * thread + tool).astype(np.uint8)
+    contrast = contrast_at(image, np.array([320.0, 320.0]))
+    assert contrast is not None
+    assert contrast.sigma < 2.0
+    assert contrast.across.min() > 0.0
+
+
 def test_an_enlarged_picture_shows_the_same_thread(scene: Scene) -> None:
     image, pixel = scene.render(0)[0], np.array(scene.seed_pixel())
     small = contrast_at(image, pixel)

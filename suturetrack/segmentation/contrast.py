@@ -228,6 +228,9 @@ def _shown(image: Image, pixel: Float64, octave: int, floor: float) -> _Shown | 
     # A lens colours the rims of a black thread, which are less like the nuisance than itself.
     in_gray = _followed(scene, *_clearest_in_gray(scene, seed, reach))
     ridges += [(standing(*ridge) / _BETTER, *ridge) for ridge in in_gray]
+    # What was followed from near the seed may pass further away, such as a tool beside the thread.
+    away = _SNAP_PX / 2**octave + 0.5
+    ridges = [r for r in ridges if _away(r[2].pixels, seed).min() <= away]
     if not ridges:
         return None
     _, weights, ridge = max(ridges, key=lambda r: r[0])
@@ -351,7 +354,12 @@ def _pixels_near(scene: _Scene, seed: Float64, reach: float) -> tuple[Int64, Int
 
 def _nearness(pixels: Float64, seed: Float64, reach: float) -> Float64:
     """(N,) what pixels count: 1 at the seed, 0.6 at the end of its reach."""
-    return np.asarray(np.exp(-np.sum((pixels - seed) ** 2, axis=1) / (2 * reach**2)))
+    return np.asarray(np.exp(-((_away(pixels, seed) / reach) ** 2) / 2))
+
+
+def _away(pixels: Float64, seed: Float64) -> Float64:
+    """(N,) distances of pixels from the seed."""
+    return np.asarray(np.linalg.norm(pixels - seed, axis=1))
 
 
 def _peaks(values: Float64, v: Int64, u: Int64) -> list[int]:
@@ -422,7 +430,7 @@ def _of_one_thread(scene: _Scene, ridge: _Ridge, seed: Float64) -> Float64:
     A ridge may turn onto another thread where the two cross.
     """
     across, metric = ridge.across(scene), np.linalg.inv(scene.clutter)
-    away = np.linalg.norm(ridge.pixels - seed, axis=1)
+    away = _away(ridge.pixels, seed)
     near = np.median(across[away <= away.min() + _SNAP_PX], axis=0)
     lengths = np.sqrt(np.einsum("ij,jk,ik->i", across, metric, across) * (near @ metric @ near))
     alike = across @ metric @ near >= _ALIKE * lengths
