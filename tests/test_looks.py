@@ -284,6 +284,30 @@ def test_looks_at_a_thread_that_bends_add_up(
     assert rms(at_rest[-1], truths[0]) < 0.1
 
 
+@pytest.mark.parametrize("is_plain_later", [True, False])
+def test_a_first_look_in_doubt_is_followed_by_two_at_once(
+    rig: StereoRig, monkeypatch: pytest.MonkeyPatch, is_plain_later: bool
+) -> None:
+    looks = []
+
+    def look(field: RidgeField, *args: object) -> Initialization:
+        looks.append(field.stamp.frame)
+        is_plain = is_plain_later and field.stamp.frame == 2
+        found = initialize(field, *args)  # type: ignore[arg-type]
+        return replace(found, confidence=0.95 if is_plain else 0.4)
+
+    looks_by(monkeypatch, look)
+    states = follow(rig, [thread(i / FPS) for i in range(FPS)])
+    assert looks[:3] == [0, 1, 2]
+    assert [state.status for state in states[:2]] == [Status.OCCLUDED] * 2
+    if is_plain_later:
+        assert all(state.status is Status.TRACKING for state in states[2:])
+        assert len(looks) == 3
+    else:
+        assert looks[3] > 2 + 0.25 * FPS
+        assert all(state.status is Status.OCCLUDED for state in states)
+
+
 def looks_at(*threads: int) -> Look:
     """Doubtful looks at one or the other of a pair, in turn; the last ones all at the last."""
     looks: list[int] = []
@@ -407,7 +431,7 @@ def test_what_was_never_sure_does_not_tell_the_length_but_is_no_stub(
     def look(field: RidgeField, rig: StereoRig, *_: object) -> Initialization:
         number = field.stamp.frame
         found = initialize(field, rig, seed_on(rig, truths[number]))
-        part, confidence = (1.0, 0.9) if number else (first, hope)
+        part, confidence = (1.0, 0.9) if number > away.start else (first, hope)
         return replace(found, curve=nurbs.part(found.curve, 0.0, part), confidence=confidence)
 
     looks_by(monkeypatch, look)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -29,6 +30,7 @@ class FromSeed:
     setup: Setup
     toward: Nurbs | None
     """A curve that tells its direction."""
+    is_urgent: ClassVar[bool] = False
 
     def find(self, field: RidgeField) -> Found:
         """The thread through the seed, or why there is none."""
@@ -71,6 +73,7 @@ class Again:
     """How clearly the left view showed it, where it may be anywhere by now; None while it is held."""
     turn: int | None = None
     """From which of the places a brief search begins; None for one that takes all the time."""
+    is_urgent: ClassVar[bool] = True
 
     def find(self, field: RidgeField) -> Found:
         """A thread of the known length."""
@@ -104,6 +107,8 @@ class Closer:
     """Where it is followed."""
     before: tuple[Follower, ...]
     """Who knows how long the thread is."""
+    is_urgent: bool = False
+    """Whether it does not wait for the fields to come: the thread has just been found."""
 
     def find(self, field: RidgeField) -> Found:
         """A thread of the known length through the place of the seed."""

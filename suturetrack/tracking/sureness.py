@@ -34,8 +34,10 @@ _BENT_PX = 2.0
 _PLACES = 64
 # What a curve may lack at an end, as a part of the thread.
 _LACKING = 0.15
-# The pause after the first look. It doubles after every few looks, so often at most where the thread
-# moves and at rest.
+# Looks that follow the first one at once: any picture may be an unlucky one.
+_FIRST_LOOKS = 2
+# The pause after these. It doubles after every few looks, so often at most where the thread moves, and at
+# rest.
 _PAUSE_NS = 250_000_000
 _FEW = 4
 _MOVING, _RESTING = 2, 4
@@ -94,15 +96,23 @@ class Sureness:
         """Whether next to nothing speaks for the curve that is followed."""
         return self._votes < _HOPELESS
 
+    @property
+    def is_new(self) -> bool:
+        """Whether what is followed is in doubt, and has hardly been looked at yet."""
+        return not self.is_sure and self._looks < _FIRST_LOOKS
+
     def asks_for_look(self, curve: Nurbs, now_ns: int) -> bool:
         """Whether it is time to look again at what is followed."""
-        passed, doublings = now_ns - self._last_ns, -(-self._looks // _FEW)
-        if self.is_sure or passed < _PAUSE_NS << min(doublings, _MOVING):
-            return False
-        if passed < _PAUSE_NS << min(doublings, _RESTING) and not self._has_bent(curve):
+        if self.is_sure or not (self.is_new or self._has_paused(curve, now_ns)):
             return False
         self._looks, self._last_ns = self._looks + 1, now_ns
         return True
+
+    def _has_paused(self, curve: Nurbs, now_ns: int) -> bool:
+        passed, doublings = now_ns - self._last_ns, -((_FIRST_LOOKS - self._looks) // _FEW)
+        if passed < _PAUSE_NS << min(doublings, _MOVING):
+            return False
+        return passed >= _PAUSE_NS << min(doublings, _RESTING) or self._has_bent(curve)
 
     def revoke(self, curve: Nurbs, now_ns: int) -> None:
         """Makes what was sure open again: looks have to tell."""
@@ -110,7 +120,7 @@ class Sureness:
             self._accused, self._is_revoked = self._outline(curve), True
             self.is_sure, self._votes, self._known_length = False, _HOPELESS, None
             self._length = 0.0
-            self._looks, self._last_ns = 0, now_ns
+            self._looks, self._last_ns = _FIRST_LOOKS, now_ns
 
     def reinstate(self) -> None:
         """Takes back what was revoked: the accusation was about something else."""

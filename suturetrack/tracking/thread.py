@@ -227,10 +227,11 @@ class Thread:
         assert self._sureness is not None
         curve = self.follower.model.curve
         is_due = self._may_be_aside and now_ns - self.looked_ns >= _PAUSE_NS
+        is_new = self._sureness.is_new
         if not (is_due or self._sureness.asks_for_look(curve, now_ns)):
             return self._search_further(now_ns)
         before = self._who_knows_its_length() if self._looks_in_vain < _LOOKS else ()
-        return Closer(self._place_to_look_from(curve), self._setup, curve, before)
+        return Closer(self._place_to_look_from(curve), self._setup, curve, before, is_urgent=is_new)
 
     def _search_further(self, now_ns: int) -> Search | None:
         """Of a thread whose length was never steady only a part may have been found."""

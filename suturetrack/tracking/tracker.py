@@ -12,7 +12,7 @@ from suturetrack.tracking.clock import StreamClock
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.looks import Look
 from suturetrack.tracking.recovery import Setup
-from suturetrack.tracking.searches import Again, Closer, FromSeed
+from suturetrack.tracking.searches import Closer, FromSeed
 from suturetrack.tracking.strands import Neighbour, Neighbours
 from suturetrack.tracking.thread import Thread, not_found
 from suturetrack.types import RidgeField, Seed, Stamp, ThreadState
@@ -152,7 +152,7 @@ class Tracker:
                 continue
             own = field.of(thread.name)
             look = Look(search, own)
-            if is_beside or (thread.is_held and not isinstance(search, Again)):
+            if is_beside or (thread.is_held and not search.is_urgent):
                 look.add(self._worker, own, self._others(thread, field.stamp))
                 self._look = look
             else:
