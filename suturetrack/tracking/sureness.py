@@ -36,8 +36,8 @@ _PLACES = 64
 _LACKING = 0.15
 # Looks that follow the first one at once: any picture may be an unlucky one.
 _FIRST_LOOKS = 2
-# The pause after these. It doubles after every few looks, so often at most where the thread moves, and at
-# rest.
+# The pause before another one. It doubles after every few looks, so often at most where the thread
+# moves and at rest.
 _PAUSE_NS = 250_000_000
 _FEW = 4
 _MOVING, _RESTING = 2, 4
@@ -89,7 +89,7 @@ class Sureness:
         self.is_sure = found.confidence >= enough and not self._is_accused(curve)
         """Whether the curve that is followed may be called the thread."""
         self._shape = self._outline(curve)
-        self._looks, self._last_ns = 0, now_ns
+        self._first_looks, self._looks, self._last_ns = _FIRST_LOOKS, 0, now_ns
 
     @property
     def is_hopeless(self) -> bool:
@@ -99,20 +99,20 @@ class Sureness:
     @property
     def is_new(self) -> bool:
         """Whether what is followed is in doubt, and has hardly been looked at yet."""
-        return not self.is_sure and self._looks < _FIRST_LOOKS
+        return not self.is_sure and self._first_looks > 0
 
     def asks_for_look(self, curve: Nurbs, now_ns: int) -> bool:
         """Whether it is time to look again at what is followed."""
-        if self.is_sure or not (self.is_new or self._has_paused(curve, now_ns)):
+        if self.is_new:
+            self._first_looks -= 1
+            return True
+        passed, doublings = now_ns - self._last_ns, -(-self._looks // _FEW)
+        if self.is_sure or passed < _PAUSE_NS << min(doublings, _MOVING):
+            return False
+        if passed < _PAUSE_NS << min(doublings, _RESTING) and not self._has_bent(curve):
             return False
         self._looks, self._last_ns = self._looks + 1, now_ns
         return True
-
-    def _has_paused(self, curve: Nurbs, now_ns: int) -> bool:
-        passed, doublings = now_ns - self._last_ns, -((_FIRST_LOOKS - self._looks) // _FEW)
-        if passed < _PAUSE_NS << min(doublings, _MOVING):
-            return False
-        return passed >= _PAUSE_NS << min(doublings, _RESTING) or self._has_bent(curve)
 
     def revoke(self, curve: Nurbs, now_ns: int) -> None:
         """Makes what was sure open again: looks have to tell."""
@@ -120,7 +120,7 @@ class Sureness:
             self._accused, self._is_revoked = self._outline(curve), True
             self.is_sure, self._votes, self._known_length = False, _HOPELESS, None
             self._length = 0.0
-            self._looks, self._last_ns = _FIRST_LOOKS, now_ns
+            self._first_looks, self._looks, self._last_ns = 0, 0, now_ns
 
     def reinstate(self) -> None:
         """Takes back what was revoked: the accusation was about something else."""
