@@ -1107,8 +1107,9 @@ def test_rows_off_the_calibration_are_measured_and_do_not_spoil_the_curve(rows: 
         assert polyline_distances(curve, thread + np.array([0.0, lower])).max() < 1
 
 
-def test_rows_that_a_thread_cannot_show_are_those_of_the_calibration() -> None:
-    scene = open_scene("pull-through", 209)
+@pytest.mark.parametrize(("rig", "number"), [("bench", 209), ("endoscope", 953)])
+def test_rows_that_a_thread_cannot_show_are_those_of_the_calibration(rig: str, number: int) -> None:
+    scene = open_scene("pull-through", number, rig)
     field, seed = field_and_seed(scene)
     assert initialize(field, scene.rig, seed).row_offset_px == 0
 

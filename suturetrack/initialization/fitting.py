@@ -105,26 +105,24 @@ def _step(fit: _Fit, samples: Samples) -> _Fit:
     curve, stiffness, noise = fit.curve, fit.stiffness.copy(), samples.variance
     data, pull = _image_equations(curve, samples)
     across, deep = _bending_equations(curve, samples)
-    mixed, weight, shown = _slip_equations(curve, samples)
     c = curve.control_points.ravel()
     free = len(c) // 3 - 2
-    step, slip, held_by = np.zeros_like(c), 0.0, 1.0
+    step = np.zeros_like(c)
     for _ in range(_EVIDENCE_STEPS):
         smoothing = stiffness[0] * across + stiffness[1] * deep
         factor = data / noise + smoothing
         if not spline.factorize(factor):
             raise FloatingPointError("the curve is not held by the images")
         step = spline.solve_factorized(factor, pull / noise - _times(smoothing, c))
-        # The slip is one more unknown, beside the band.
-        per_px = spline.solve_factorized(factor, mixed / noise)
-        held_by = weight - mixed @ per_px + noise / _ANY_SLIP_PX**2
-        slip = (shown - mixed @ step) / held_by
-        step = step if fit.is_level else step - slip * per_px
         inverse = spline.band_of_inverse(factor)
         for k, (energy, rank) in enumerate(((across, 2 * free), (deep, free))):
             held = rank - stiffness[k] * _trace(inverse, energy)
             bend = (c + step) @ _times(energy, c + step)
             stiffness[k] = min(max(held, 1.0) / max(bend, 1e-12), _STIFFEST)
+    slip, sigma = _slip(curve, samples, smoothing)
+    if not fit.is_level:
+        mixed = _slip_equations(curve, samples)[0]
+        step = step - slip * spline.solve_factorized(factor, mixed / noise)
     return replace(
         fit,
         curve=nurbs.curve_from(
@@ -133,8 +131,28 @@ def _step(fit: _Fit, samples: Samples) -> _Fit:
         stiffness=stiffness,
         rows=fit.rows if fit.is_level else fit.rows + slip,
         slip_px=slip,
-        slip_sigma_px=float(np.sqrt(noise / held_by)),
+        slip_sigma_px=sigma,
     )
+
+
+def _slip(curve: Nurbs, samples: Samples, smoothing: Float64) -> tuple[float, float]:
+    """How many px lower the right view's rows seem to lie, and the standard deviation of that.
+
+    It is one more unknown, beside the band of what is asked of the curve. The ends tell nothing of it: in a
+    hole that a thread goes into the views show different ones.
+    """
+    crests, pull = _crest_equations(curve, samples)
+    mixed, weight, shown = _slip_equations(curve, samples)
+    noise = samples.variance
+    factor = crests / noise + smoothing
+    if not spline.factorize(factor):
+        return 0.0, np.inf
+    step = spline.solve_factorized(
+        factor, pull / noise - _times(smoothing, curve.control_points.ravel())
+    )
+    per_px = spline.solve_factorized(factor, mixed / noise)
+    held_by = weight - mixed @ per_px + noise / _ANY_SLIP_PX**2
+    return float((shown - mixed @ step) / held_by), float(np.sqrt(noise / held_by))
 
 
 def _slip_equations(curve: Nurbs, samples: Samples) -> tuple[Float64, float, float]:
