@@ -107,7 +107,8 @@ def test_a_look_for_one_thread_holds_no_other_up(
     beside = 0
     for field in fields[4:]:
         states.append(tracker.step(field).states)
-        if began.is_set() and not may_end.is_set():
+        if tracker._look is not None and not may_end.is_set():
+            assert began.wait(30)
             assert not ended.is_set()
             assert states[-1][0].status is Status.TRACKING
             assert rms(states[-1][0], pair(field.stamp.frame)[0]) < 0.15

@@ -14,9 +14,10 @@ from suturetrack.types import Float64, Nurbs
 
 SURE = 0.5
 """Confidence of a single look from which its curve may be called the thread."""
-# And that of one that needs no other: the first one, and one after looks that were in doubt.
+# And that of a first one that needs no other.
 _AT_ONCE = 0.75
 SINGLE = 0.9
+"""Confidence of a look that is enough alone, whatever others were in doubt of."""
 # Votes that make a curve sure, if no doubt stays: of a sure look one, and half of one of others; and of one
 # that was looked at often, against the number of looks.
 _ENOUGH, _OFTEN_ENOUGH = 1.5, 0.3
@@ -179,17 +180,15 @@ class Sureness:
         there, here = self._lines(found)[0], self._lines(followed)[0]
         return bool(np.mean(polyline_distances(here, there) < _SAME_PX) < _LITTLE)
 
-    def is_part(self, followed: Nurbs, found: Nurbs) -> bool:
-        """Whether all of what is followed is a part of what was found."""
-        both = zip(self._lines(found), self._lines(followed), strict=True)
-        return all(polyline_distances(part, whole).max() < _SAME_PX for whole, part in both)
+    def is_part(self, part: Nurbs, whole: Nurbs) -> bool:
+        """Whether one curve lies on another one, as far as it reaches."""
+        both = zip(self._lines(part), self._lines(whole), strict=True)
+        return all(polyline_distances(*lines).max() < _SAME_PX for lines in both)
 
     def lacks_more(self, found: Nurbs, followed: Nurbs) -> bool:
         """Whether what was found is a part of what is followed, and lacks more than a little."""
-        if length_of(found) > (1 - _LACKING) * length_of(followed):
-            return False
-        both = zip(self._lines(found), self._lines(followed), strict=True)
-        return all(polyline_distances(*lines).max() < _SAME_PX for lines in both)
+        is_short = length_of(found) <= (1 - _LACKING) * length_of(followed)
+        return is_short and self.is_part(found, followed)
 
     def _begin(self, found: Initialization, votes: float) -> None:
         """With what speaks for another curve."""
