@@ -59,7 +59,7 @@ class EndWatch:
         self._plain_ns = now_ns
         """When neither end was held that showed further on."""
         self.shows_more = False
-        """Whether an end that is held has shown further on for a while."""
+        """Whether an end that is held has shown further on for a while, of a length that was not steady."""
         self._gone_on = [0.0, 0.0]
         """By how much the ends have gone on of late."""
         self.settled = False
@@ -96,7 +96,8 @@ class EndWatch:
         seen = [end not in doubted for end in (0, 1)]
         if not any(_leaps(steps[end]) for end in doubted):
             self._plain_ns = now_ns
-        self.shows_more = (now_ns - self._plain_ns) * _NS > _ASKS_S
+        is_steady = (now_ns - self._steady_ns) * _NS > _SETTLING_S
+        self.shows_more = not is_steady and (now_ns - self._plain_ns) * _NS > _ASKS_S
         for end in doubted:
             offsets[end] = self._held(end, steps[end], offsets[1 - end], length, seen[1 - end])
         for end in (0, 1):

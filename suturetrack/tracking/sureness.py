@@ -90,12 +90,16 @@ class Sureness:
         self.is_sure = found.confidence >= enough and not self._is_accused(curve)
         """Whether the curve that is followed may be called the thread."""
         self._shape = self._outline(curve)
-        self._first_looks, self._looks, self._last_ns = _FIRST_LOOKS, 0, now_ns
+        self._first_looks, self._looks, self._last_ns = 0, 0, now_ns
 
     @property
     def is_hopeless(self) -> bool:
         """Whether next to nothing speaks for the curve that is followed."""
         return self._votes < _HOPELESS
+
+    def ask_at_once(self) -> None:
+        """Has what was found from a seed looked at again without a pause."""
+        self._first_looks = _FIRST_LOOKS
 
     @property
     def is_new(self) -> bool:

@@ -303,6 +303,8 @@ class Thread:
         self._seeded_at = _nearest(outcome.found.curve, self._seed, self._setup.rig)
         self._is_seed_shared = outcome.found.is_seed_shared
         self._hold(outcome, FOUND)
+        assert self._sureness is not None
+        self._sureness.ask_at_once()
 
     def _take_again(self, outcome: Outcome, known_lengths: tuple[float, ...]) -> None:
         """A thread that is held still gives way only to a curve that is sure."""
