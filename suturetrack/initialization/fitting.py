@@ -119,10 +119,10 @@ def _step(fit: _Fit, samples: Samples) -> _Fit:
             held = rank - stiffness[k] * _trace(inverse, energy)
             bend = (c + step) @ _times(energy, c + step)
             stiffness[k] = min(max(held, 1.0) / max(bend, 1e-12), _STIFFEST)
-    slip, sigma = _slip(curve, samples, smoothing)
+    slipping = _slip_equations(curve, samples)
+    slip, sigma = _slip(curve, samples, smoothing, slipping)
     if not fit.is_level:
-        mixed = _slip_equations(curve, samples)[0]
-        step = step - slip * spline.solve_factorized(factor, mixed / noise)
+        step = step - slip * spline.solve_factorized(factor, slipping[0] / noise)
     return replace(
         fit,
         curve=nurbs.curve_from(
@@ -135,14 +135,16 @@ def _step(fit: _Fit, samples: Samples) -> _Fit:
     )
 
 
-def _slip(curve: Nurbs, samples: Samples, smoothing: Float64) -> tuple[float, float]:
+def _slip(
+    curve: Nurbs, samples: Samples, smoothing: Float64, slipping: tuple[Float64, float, float]
+) -> tuple[float, float]:
     """How many px lower the right view's rows seem to lie, and the standard deviation of that.
 
     It is one more unknown, beside the band of what is asked of the curve. The ends tell nothing of it: in a
-    hole that a thread goes into the views show different ones.
+    hole that a thread goes into the views show different ones. `slipping` is of `_slip_equations`.
     """
     crests, pull = _crest_equations(curve, samples)
-    mixed, weight, shown = _slip_equations(curve, samples)
+    mixed, weight, shown = slipping
     noise = samples.variance
     factor = crests / noise + smoothing
     if not spline.factorize(factor):

@@ -14,6 +14,7 @@ from suturetrack.tracking.length import has_length, length_error
 from suturetrack.tracking.overlaps import doubting_ends, known_as, lies_on, means_no_other
 from suturetrack.tracking.pursuit import Pursuit
 from suturetrack.tracking.recovery import Setup, directed, find_again, find_elsewhere, starts_on
+from suturetrack.tracking.sampling import length_of
 from suturetrack.tracking.strands import Neighbours
 from suturetrack.tracking.sureness import SINGLE
 from suturetrack.types import InputError, Nurbs, RidgeField, Seed
@@ -133,11 +134,12 @@ class Closer:
 
 @dataclass(frozen=True, eq=False)
 class Further(Closer):
-    """A look at a thread that is followed for sure, but shows beyond an end: it has another length, and
+    """A look at a thread that is followed for sure, but shows beyond an end: it is longer than was known, and
     nothing else tells that it is the thread."""
 
     def _may_be(self, found: Initialization) -> bool:
-        return found.confidence >= SINGLE and not super()._may_be(found)
+        is_longer = length_of(found.curve) > length_of(self.followed)
+        return is_longer and found.confidence >= SINGLE and not super()._may_be(found)
 
 
 def _none_of(others: Neighbours, found: Initialization, rig: StereoRig) -> Initialization | None:

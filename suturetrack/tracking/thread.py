@@ -20,7 +20,6 @@ from suturetrack.tracking.overlaps import doubting_ends
 from suturetrack.tracking.pursuit import Pursuit
 from suturetrack.tracking.recovery import Setup
 from suturetrack.tracking.reliability import RELIABILITY_SAMPLES
-from suturetrack.tracking.sampling import length_of
 from suturetrack.tracking.searches import Again, Closer, FromSeed, Further, Search, lengths
 from suturetrack.tracking.springs import sprung_in_depth
 from suturetrack.tracking.strands import Neighbours
@@ -382,8 +381,7 @@ class Thread:
         found, state = outcome.found, outcome.state
         if state is None or state.status is not Status.TRACKING or state.curve is None:
             return
-        is_longer = length_of(found.curve) > length_of(search.followed)
-        if is_longer and self._sureness.is_part(search.followed, found.curve):
+        if self._sureness.is_part(search.followed, found.curve):
             self._hold(outcome, "found further on")
 
     def _hold(
