@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from services.bench import BenchConfig, footage, report, segmentation
+from services.bench import BenchConfig, footage, initialization, report, segmentation
 from services.bench import run as bench
 from services.bench.footage import FootageBench
 from services.bench.initialization import InitializationBench
@@ -170,8 +170,22 @@ def test_first_curves_are_judged_by_their_order_however_they_are_filmed() -> Non
     config = InitializationBench(("figure8-107",), seeds=1, picture=picture)
     (row,) = initialization_rows(config)
     assert row.solved
+    assert row.right
     assert row.in_order_percent > 95
     assert row.mean < 0.3
+
+
+def test_first_curves_that_mislead_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A curve that is right, one with an end off that says so, and one that does not."""
+    config = InitializationBench(("figure8-107",), seeds=1)
+    (row,) = initialization_rows(config)
+    wrong = replace(row, right=False)
+    three = [row, replace(wrong, confidence=0.2), replace(wrong, confidence=0.9)]
+    monkeypatch.setattr(initialization, "rows", lambda _: iter(three))
+    console = Console(width=400, record=True)
+    initialization.run(config, console)
+    assert "1 of 3 right" in (text := console.export_text())
+    assert "1 of the others with a confidence of 0.5 or more" in text
 
 
 def test_the_bench_shows_what_an_automatic_c_is_worth(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ import csv
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,9 @@ _SAMPLES = 600
 _ORDER_RADIUS = 0.01
 """How near to the truth a place of the curve is that is in order, as a share of the true length."""
 _IN_ORDER_PERCENT = 95.0
+_RIGHT_RMS_MM, _RIGHT_END_MM = 0.3, 1.0
+_SURE = 0.5
+"""Confidence from which a first curve that is not right misleads."""
 _ERRORS = ("mean", "largest", "rms", "length", "end", "order")
 
 
@@ -57,6 +60,9 @@ class Row:
     data: str
     seed: int
     solved: bool
+    """Mean error below 1 % of the true length and length error below 5 %, as published."""
+    right: bool | None
+    """RMS of 0.3 mm and ends within 1 mm at most; None for pairs, whose unit may be any."""
     confidence: float
     mean: float
     published_mean: float
@@ -94,6 +100,14 @@ def run(config: InitializationBench, console: Console) -> list[Row]:
             f"{np.median([r.mean for r in solved]):.3g}, worst {max(r.mean for r in solved):.3g}; "
             f"{sum(r.in_order_percent >= _IN_ORDER_PERCENT for r in table)} in order"
         )
+    measured = [r for r in table if r.right is not None]
+    if measured:
+        wrong = [r for r in measured if not r.right]
+        console.print(
+            f"{len(measured) - len(wrong)} of {len(measured)} right (RMS {_RIGHT_RMS_MM:g} mm, ends "
+            f"{_RIGHT_END_MM:g} mm at most); {sum(r.confidence >= _SURE for r in wrong)} of the others "
+            f"with a confidence of {_SURE:g} or more"
+        )
     return table
 
 
@@ -103,8 +117,17 @@ def _scene(name: str, seed: int, config: InitializationBench) -> Row:
     truth = next(t for t in scene.truth(0) if t.thread == thread)
     frame = StereoFrame(Stamp(0, 0, 0), *scene.render(0))
     start = Seed(thread, pixel=scene.seed_pixel(0, thread))
-    unit = scene.rig.mm_per_unit
-    return _row(f"{name}, {config.rig}", seed, frame, scene.rig, start, truth.points, unit, {})
+    row = _row(
+        f"{name}, {config.rig}",
+        seed,
+        frame,
+        scene.rig,
+        start,
+        truth.points,
+        scene.rig.mm_per_unit,
+        {},
+    )
+    return replace(row, right=bool(row.rms <= _RIGHT_RMS_MM and row.worst_end <= _RIGHT_END_MM))
 
 
 def _pairs(folder: Path) -> Iterator[Row]:
@@ -163,6 +186,7 @@ def _row(
         data=data,
         seed=number,
         solved=_is_solved(errors, truth, unit),
+        right=None,
         confidence=confidence,
         mean=errors["mean"],
         published_mean=float(published.get("e_mean", nan)),
@@ -196,7 +220,6 @@ def _errors(curve: Nurbs, truth: Float64 | None, unit: float) -> dict[str, float
 
 
 def _is_solved(errors: dict[str, float], truth: Float64 | None, unit: float) -> bool:
-    """Mean error below 1 % of the true length and length error below 5 %."""
     if truth is None:
         return bool(np.isfinite(errors["pixels"]))
     near = errors["mean"] < 0.01 * unit * polyline_length(truth)
