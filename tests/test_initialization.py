@@ -20,7 +20,7 @@ from suturetrack.initialization import (
     remaining,
 )
 from suturetrack.initialization.arms import Arms
-from suturetrack.initialization.colours import darkening
+from suturetrack.initialization.colours import another_begins, darkening
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.crest import View, find_crest
 from suturetrack.initialization.depth import Depth
@@ -639,6 +639,12 @@ def test_a_thread_that_goes_on_in_the_shade_is_found_whole() -> None:
     assert_is_found_whole("clutter", 4415, "endoscope")
 
 
+@pytest.mark.parametrize(("scenario", "seed"), [("fast", 6002), ("leaves-view", 6011)])
+def test_a_thread_over_ground_of_several_colours_is_found_whole(scenario: str, seed: int) -> None:
+    """Over darker ground it is fainter, and a thin one takes a part of its colour from the ground."""
+    assert_is_found_whole(scenario, seed, "bench")
+
+
 def painted(strands: list[tuple[Float64, tuple[int, int, int]]], rig: StereoRig) -> RidgeField:
     """The field of strands (k, 2) of some colours, the last one on top, at one depth, on gray ground."""
     views = []
@@ -758,6 +764,19 @@ def test_shade_is_told_from_another_colour() -> None:
     assert np.isnan(darkening(lit, shade + np.array([0.3, 0, 0])))
     assert np.isnan(darkening(lit, shade[:5]))
     assert np.isnan(darkening(lit, shade * np.nan))
+
+
+@pytest.mark.parametrize(
+    ("step", "is_another"), [((0.1, 0.24, -0.33), False), ((0.5, -0.2, 0.3), True)]
+)
+def test_what_differs_as_parts_of_one_thread_do_is_no_other(
+    step: tuple[float, float, float], is_another: bool
+) -> None:
+    """However steady its colour is before and behind."""
+    tints = np.tile([0.1, -0.2, 4.0], (400, 1)) + np.random.default_rng(0).normal(0, 0.02, (400, 3))
+    tints[250:] += step
+    start = another_begins(tints, 100)
+    assert start == (pytest.approx(250, abs=3) if is_another else 400)
 
 
 def test_colours_are_known_of_views_that_are_reduced_or_raised() -> None:

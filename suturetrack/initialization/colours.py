@@ -28,6 +28,8 @@ _WINDOW, _GAP = 22, 3
 """Points on each side of a change that tell it, and those about it that do not."""
 _SURELY, _FEWEST = 4.4, 20
 """How large a change is, against those of the chain so far, of which there are so many at least."""
+_APART = 6.75
+"""Energy by which its parts differ at least: those of one thread on ground of several colours do by less."""
 _OTHER = 0.4
 """Share of a change by which all that follows is nearer to it than what came before."""
 _SHORTEST, _LEAST_SHARE = 40, 0.13
@@ -68,9 +70,13 @@ def difference(one: Float64, other: Float64) -> float:
     thread; 0 where one is not known."""
     if min(len(one), len(other)) < _SHORTEST_ARM:
         return 0.0
+    energy = _energy(one, other) - _COMMON
+    return max(energy, 0.0) if np.isfinite(energy) else 0.0
+
+
+def _energy(one: Float64, other: Float64) -> float:
     step = (np.median(one, axis=0) - np.median(other, axis=0)) / _WITHIN
-    energy = 0.5 * float(step @ step) - _COMMON
-    return max(energy, 0.0) if np.isfinite(step).all() else 0.0
+    return 0.5 * float(step @ step)
 
 
 def darkening(one: Float64, other: Float64) -> float:
@@ -103,7 +109,8 @@ def another_begins(tints: Float64, first: int) -> int:
             break
         place, towards = int(places[told[k]]), precision[k] @ steps[told[k]] / size[k]
         if _is_for_good(tints, middle, place, towards):
-            return _where(tints, middle, place, towards)
+            start = _where(tints, middle, place, towards)
+            return start if _energy(tints[:start], tints[start:]) > _APART else count
     return count
 
 

@@ -45,6 +45,8 @@ _STEP, _LOWER = 0.7, 0.85
 _IN_SHADE, _STEADY = 100, 0.2
 """Points of what has the colour of the thread, and goes on where it ends, from which it is the thread in the
 shade, and by how much brighter or darker it may be all the same (of the logarithm)."""
+_SHADED = 0.45
+"""By how much darker the thread may be where its ground is."""
 _CUT = {FADES: 0.49, RECOLOURED: 0.2}
 """What is left of the confidence in an end at which a vein goes on, or another thread: below that one it may
 lie hidden."""
@@ -270,10 +272,21 @@ def _stops_at(
     stop = min(stops)
     # The strength tells an end below another thread, too, the colour only where that begins to hide it.
     if stop < len(pixels) or ridges.tints is None:
-        is_fall = stop == stops[0]
-        is_shaded = is_fall and _goes_on_in_the_shade(ridges, pixels[:stop], pixels[stop:])
-        return (len(pixels) if is_shaded else stop), FADES
+        sides = pixels[:stop], pixels[stop:]
+        is_shaded = stop == stops[0] and _goes_on_in_the_shade(ridges, *sides)
+        is_own = is_shaded or _looks_the_same(ridges, *sides)
+        return (len(pixels) if is_own else stop), FADES
     return another_begins(ridges.tints.along(pixels), first), RECOLOURED
+
+
+def _looks_the_same(ridges: Ridges, before: Float64, behind: Float64) -> bool:
+    """Whether what is fainter behind a place, (m, 2) pixels, has the colour and about the brightness of the
+    thread (k, 2), near the place and as a whole: it is the thread, on a darker ground."""
+    if ridges.tints is None:
+        return False
+    sides = [(before, behind), (before[-_SIDE:-_STEP_POINTS], behind[_STEP_POINTS:_SIDE])]
+    steps = [darkening(*map(ridges.tints.along, pair)) for pair in sides]
+    return all(-_STEADY < step < _SHADED for step in steps)
 
 
 def _goes_on_in_the_shade(ridges: Ridges, before: Float64, behind: Float64) -> bool:
