@@ -227,6 +227,14 @@ def test_distorted_lenses_show_the_thread_where_the_calibration_says() -> None:
         open_scene("figure8-107", picture=replace(look, distortion=3))
 
 
+def test_a_gripper_beside_the_view_is_not_folded_into_it_by_a_barrel_lens() -> None:
+    """Steel that shines would cover a thirtieth of the picture."""
+    scene = open_scene("grasped", 6311, picture=Picture(distortion=-0.25))
+    for view in scene.render(0):
+        assert (view.min(axis=2) > 200).mean() < 0.01
+    assert scene.truth(0)[0].visible.all()
+
+
 def test_contact_sheet_has_a_row_for_each_scenario() -> None:
     sheet = contact_sheet(["figure8-107"], "endoscope", 1)
     assert sheet.shape == (240, 1280, 3)

@@ -65,6 +65,17 @@ def misalign(
     return replace(rig, left=cameras[0], right=cameras[1])
 
 
+def folds_back(rig: StereoRig, points: Float64) -> tuple[Bool, Bool]:
+    """(N,) whether (N, 3) points of the rectified left frame lie so far aside that the formula of a barrel
+    lens brings them back into the picture, left and right: r (1 + k1 r^2) falls from r = (-3 k1)^-1/2 on."""
+    folded = []
+    for camera, pixels in zip((rig.left, rig.right), rig.project(points), strict=True):
+        axis, focal = camera.projection[:2, 2], camera.projection[0, 0]
+        square = (((pixels - axis) / focal) ** 2).sum(-1)
+        folded.append(1 + 3 * camera.distortion[0] * square < 0)
+    return folded[0], folded[1]
+
+
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
     """The pose of the table (x and y in its plane, z up, mm) in the rectified left frame."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from suturetrack.camera import StereoRig
 from suturetrack.kernels import tubes
 from suturetrack.stage.appearance import STEEL, Look, Surface, shading, vignette
-from suturetrack.stage.cameras import Viewpoint
+from suturetrack.stage.cameras import Viewpoint, folds_back
 from suturetrack.types import Bool, Float32, Float64, Image
 
 # The pixel's own blur: the standard deviation of a box one pixel wide.
@@ -155,10 +155,11 @@ class Painter:
         tubes.shade(first, path, light, np.array(surface.colour), gloss, self._fragments)
 
     def _path(self, table_points: Float64, radius: Float64) -> Float64:
-        """(n, 5) for `tubes.splat`: up to where the strand comes too near to the camera."""
+        """(n, 5) for `tubes.splat`: up to where the strand comes too near to the camera, or too far aside."""
         points = self._view.to_camera(table_points)
-        near = np.flatnonzero(points[:, 2] < 0.3 * self._focus)
-        points = points[: near[0]] if len(near) else points
+        is_aside = folds_back(self._rig, points)[self._right]
+        gone = np.flatnonzero((points[:, 2] < 0.3 * self._focus) | is_aside)
+        points = points[: gone[0]] if len(gone) else points
         depth = points[:, 2]
         radius_px = np.broadcast_to(radius, len(table_points))[: len(depth)] * self._focal / depth
         defocus = 10 * self._look.defocus_px * np.abs(1 - self._focus / depth)

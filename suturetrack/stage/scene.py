@@ -14,6 +14,7 @@ from suturetrack.stage.cameras import (
     RIGS,
     Viewpoint,
     choose_viewpoint,
+    folds_back,
     make_rig,
     misalign,
     push_out,
@@ -203,8 +204,9 @@ class Scene:
         """(N,) whether both cameras see (N, 3) points: inside the images and behind no tool."""
         size = np.array(self.rig.image_size)
         visible = np.ones(len(points), bool)
-        for view in self._real_rig.project_raw(points):
-            visible &= np.all((view >= -0.5) & (view <= size - 0.5), axis=1)
+        aside = folds_back(self._real_rig, points)
+        for view, is_aside in zip(self._real_rig.project_raw(points), aside, strict=True):
+            visible &= np.all((view >= -0.5) & (view <= size - 0.5), axis=1) & ~is_aside
         for painter in self._painters:
             for tool in tools:
                 visible &= ~painter.hides(tool, points)
