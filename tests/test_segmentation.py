@@ -592,6 +592,19 @@ def test_a_wide_thread_gets_a_wide_filter() -> None:
         assert lowest <= contrast.sigma <= highest
 
 
+@pytest.mark.parametrize(
+    ("scenario", "seed", "size", "width"),
+    [("two-threads", 6320, (1920, 1080), 8.6), ("clutter", 6402, (1280, 720), 5.9)],
+)
+def test_what_runs_beside_the_shine_on_a_wide_thread_is_not_taken_for_it(
+    scenario: str, seed: int, size: tuple[int, int], width: float
+) -> None:
+    scene = open_scene(scenario, seed, "endoscope", picture=Picture(size=size))
+    contrast = contrast_at(scene.render(0)[0], np.array(scene.seed_pixel()))
+    assert contrast is not None
+    assert 0.3 < contrast.sigma / width < 0.6
+
+
 @pytest.mark.parametrize("away", [16, 18])
 def test_a_seed_teaches_a_thread_and_not_the_tool_beside_it(away: int) -> None:
     thread = 150.0 - line_image(0.2, 2.0, size=641)

@@ -40,7 +40,7 @@ _WIDTH_REACH = 40
 _STEP_ACROSS = 0.5
 _ACROSS = np.arange(-12.0, 12.01, _STEP_ACROSS)
 _ACROSS_RIDGE = np.arange(-4.0, 4.01, _STEP_ACROSS)
-_NARROW_PX = 1.4
+_NARROW_PX = 1.33
 """How far from its crest the ridge of a narrow thread is half as high, px."""
 _NOISE_QUANTILE = 0.9
 _ABOVE_NOISE = 2.0

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from suturetrack.kernels.ridge import gaussian_taps
 from suturetrack.polylines import unit
@@ -50,6 +51,9 @@ _FLOOR, _BRIGHT = 1.0, 70.0
 _SHADOW = 0.05
 # Scales that show the thread by less than this share of the clearest one are too small or too large.
 _CLEAR = 0.7
+# How far beside the middle of a wider ridge one runs that is a half of it, in scales of the wider one: pixels
+# that are rounded leave 0.33 between middles.
+_ASIDE = 0.45
 # Of the scale that responds most, the share at which the middle is seen best.
 _BELOW = 0.8
 # Places beside a ridge, against the scale, at which its rims are.
@@ -151,12 +155,11 @@ def _contrast_at(image: Image, pixel: Float64, floor: float) -> Contrast | None:
     if not found:
         return None
     clearest = max(s.score for s in found)
+    clear = [s for s in found if s.score >= _CLEAR * clearest]
+    whole = [s for s in clear if not any(s.is_half_of(wider) for wider in clear)]
     # The response is strongest where sigma is half the width. Of scales that respond alike the
     # smaller one keeps neighbours apart.
-    best = max(
-        (s for s in found if s.score >= _CLEAR * clearest),
-        key=lambda s: s.response * SIGMAS[s.octave] ** -0.4,
-    )
+    best = max(whole, key=lambda s: s.response * SIGMAS[s.octave] ** -0.4)
     # The middle is seen best below that scale: in the image that is twice as large.
     octave, sigma, zoom = 0, SIGMAS[0], 1
     if best.octave:
@@ -212,6 +215,16 @@ class _Shown:
     score: float
     response: float
     """Length of the second derivative across, over the channels."""
+
+    def is_half_of(self, wider: _Shown) -> bool:
+        """Whether a wider scale shows the thread, and this one what runs on one side of the shine on it."""
+        if wider.octave <= self.octave or wider.response <= self.response:
+            return False
+        own, whole = (s.ridge.pixels * 2**s.octave for s in (self, wider))
+        away = _away(own, np.zeros(2))
+        near = own[away <= max(_HALF_PX, np.sort(away)[:_SHORTEST_PX].max())]
+        aside = float(np.median(cKDTree(whole).query(near)[0]))
+        return aside > _ASIDE * SIGMAS[wider.octave]
 
 
 def _shown(image: Image, pixel: Float64, octave: int, floor: float) -> _Shown | None:
