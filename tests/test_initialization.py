@@ -704,14 +704,15 @@ def bow() -> tuple[Float64, Float64, Float64, Float64]:
 
 
 @pytest.mark.parametrize(
-    ("length", "grey", "is_doubtful"), [(120, 110, True), (120, 165, False), (12, 110, False)]
+    ("ahead", "length", "grey", "is_doubtful"),
+    [(3.5, 120, 110, True), (4.5, 120, 110, False), (3.5, 120, 165, False), (3.5, 12, 110, False)],
 )
 def test_an_end_is_doubted_beside_what_may_be_thread_only(
-    rig: StereoRig, length: float, grey: int, is_doubtful: bool
+    rig: StereoRig, ahead: float, length: float, grey: int, is_doubtful: bool
 ) -> None:
-    """Ridges that are far fainter, or lead nowhere, are not what the thread goes on as."""
+    """Ridges behind ground, far fainter ones, and such as lead nowhere are not what it goes on as."""
     t, own, way, normal = bow()
-    other = own[-1] + 5 * way + length * (t[:, None] - 0.5) * normal
+    other = own[-1] + ahead * way + length * (t[:, None] - 0.5) * normal
     field = painted([(other, (grey, grey, grey)), (own, BLUE)], rig)
     found = initialize(field, rig, Seed(pixel=tuple(own[150])))
     assert any("an end beside another ridge" in why for why in found.reasons) == is_doubtful
