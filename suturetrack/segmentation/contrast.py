@@ -221,8 +221,7 @@ class _Shown:
         if wider.octave <= self.octave or wider.response <= self.response:
             return False
         own, whole = (s.ridge.pixels * 2**s.octave for s in (self, wider))
-        away = _away(own, np.zeros(2))
-        near = own[away <= max(_HALF_PX, np.sort(away)[:_SHORTEST_PX].max())]
+        near = own[np.argsort(_away(own, np.zeros(2)))[:_SHORTEST_PX]]
         aside = float(np.median(cKDTree(whole).query(near)[0]))
         return aside > _ASIDE * SIGMAS[wider.octave]
 
