@@ -6,7 +6,7 @@ import csv
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -117,17 +117,8 @@ def _scene(name: str, seed: int, config: InitializationBench) -> Row:
     truth = next(t for t in scene.truth(0) if t.thread == thread)
     frame = StereoFrame(Stamp(0, 0, 0), *scene.render(0))
     start = Seed(thread, pixel=scene.seed_pixel(0, thread))
-    row = _row(
-        f"{name}, {config.rig}",
-        seed,
-        frame,
-        scene.rig,
-        start,
-        truth.points,
-        scene.rig.mm_per_unit,
-        {},
-    )
-    return replace(row, right=bool(row.rms <= _RIGHT_RMS_MM and row.worst_end <= _RIGHT_END_MM))
+    unit = scene.rig.mm_per_unit
+    return _row(f"{name}, {config.rig}", seed, frame, scene.rig, start, truth.points, unit, {})
 
 
 def _pairs(folder: Path) -> Iterator[Row]:
@@ -155,7 +146,7 @@ def _pairs(folder: Path) -> Iterator[Row]:
             load_calibration(case / "calibration.yaml"),
             Seed(pixel=(seed["u"], seed["v"])),
             truth,
-            1.0,
+            None,
             published.get(case.name, {}),
         )
 
@@ -167,10 +158,11 @@ def _row(
     rig: StereoRig,
     seed: Seed,
     truth: Float64 | None,
-    unit: float,
+    mm_per_unit: float | None,
     published: dict[str, str],
 ) -> Row:
-    nan = float("nan")
+    """In mm; where `mm_per_unit` is None in the calibration's unit, and nothing tells what is right."""
+    nan, unit = float("nan"), mm_per_unit or 1.0
     segmenter = Segmenter(rig)
     began = time.perf_counter()
     try:
@@ -186,7 +178,7 @@ def _row(
         data=data,
         seed=number,
         solved=_is_solved(errors, truth, unit),
-        right=None,
+        right=None if mm_per_unit is None else _is_right(errors),
         confidence=confidence,
         mean=errors["mean"],
         published_mean=float(published.get("e_mean", nan)),
@@ -217,6 +209,10 @@ def _errors(curve: Nurbs, truth: Float64 | None, unit: float) -> dict[str, float
         "end": unit * max(error.ends),
         "order": 100 * metrics.in_order(found, truth, radius),
     }
+
+
+def _is_right(errors: dict[str, float]) -> bool:
+    return bool(errors["rms"] <= _RIGHT_RMS_MM and errors["end"] <= _RIGHT_END_MM)
 
 
 def _is_solved(errors: dict[str, float], truth: Float64 | None, unit: float) -> bool:

@@ -51,10 +51,10 @@ _STRAIN = 1.5
 _RUNS_ON = 0.55
 """Price of a merge below which an end might as well run on."""
 _GAP, _GAP_SAMPLES = 0.85, 13
-"""Least ||V|| between an end and another strand, against both, below which a gap is seen there."""
+"""Least ||V|| between an end and the thread itself, against both, below which a gap is seen there."""
 _GROUND = 0.5
-"""The same, below which ground is seen there: in 400 starts beside other threads all eight such ends were
-right, and six of the 31 others."""
+"""The same of an end and another strand: in 400 starts beside other threads all eight ends before ground
+were right, and six of the 31 others."""
 _SEPARATE_PX = 4.2
 """Distance from which an end beside the thread itself is seen to end: nearer ones run into it."""
 _PARALLEL = 0.7
