@@ -21,10 +21,10 @@ _WIDER, _MARGIN = 0.1, 0.005
 _SHORTEST_PX, _END = 15.0, 0.05
 # How far away the thread has to run, what has to be seen of it there, and what may be less seen of the curve.
 _AWAY_PX, _SEEN, _LOSS = 2.0, 0.9, 0.02
+# How far a bridge leads away at once, at least: of 361 that did not, none did so later.
+_LEAVES_PX = 1.0
 # A thread changes its bending less than a curve that leaves it and comes back.
 _CALMER = 0.4
-# How often a bridge is laid on the field beside the old stretch.
-_ROUNDS = 2
 _PLACES = 200
 
 Stretch = tuple[float, float]
@@ -53,12 +53,15 @@ def led_back(
     found = None
     now = fitted(curve, others)
     for stretch in _crowded_stretches(now):
-        tried, beside = _bridged(now.fit.curve, stretch), _with_stretch(others, now, stretch, rig)
-        for _ in range(_ROUNDS):
-            tried = fitted(tried, beside).fit.curve
-        other = fitted(tried, others)
-        if _is_better(other, now, stretch, known, rig):
-            found = now = other
+        bridge, beside = _bridged(now.fit.curve, stretch), _with_stretch(others, now, stretch, rig)
+        if not _is_calmer(bridge, now.fit.curve, stretch):
+            continue
+        tried = fitted(bridge, beside)
+        if _away(tried, now, stretch, rig) < _LEAVES_PX:
+            continue
+        tried = fitted(fitted(tried.fit.curve, beside).fit.curve, others)
+        if _is_better(tried, now, stretch, known, rig):
+            found = now = tried
     return found
 
 
@@ -111,18 +114,21 @@ def _unrest(curve: Nurbs, stretch: Stretch) -> float:
     return float(np.sum((_third_derivatives(curve)[inside] @ curve.control_points) ** 2))
 
 
+def _is_calmer(tried: Nurbs, now: Nurbs, stretch: Stretch) -> bool:
+    return _unrest(tried, stretch) < _CALMER * _unrest(now, stretch)
+
+
 def _is_better(
     tried: Evidence, now: Evidence, stretch: Stretch, known: KnownLength, rig: StereoRig
 ) -> bool:
     """Whether another course of the stretch is seen, elsewhere, and more likely that of the thread."""
     s = tried.fit.samples.s
     is_seen = tried.seen[(stretch[0] < s) & (s < stretch[1])].mean() >= _SEEN
-    is_calmer = _unrest(tried.fit.curve, stretch) < _CALMER * _unrest(now.fit.curve, stretch)
     length, noise = length_of(tried.fit.curve), tried.length_noise
     return bool(
         is_seen
         and tried.share >= now.share - _LOSS
-        and is_calmer
+        and _is_calmer(tried.fit.curve, now.fit.curve, stretch)
         and _away(tried, now, stretch, rig) >= _AWAY_PX
         and not (known.is_exceeded(length, noise) or known.is_undercut(length, noise))
     )
