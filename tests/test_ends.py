@@ -51,6 +51,26 @@ def test_ends_are_found_without_bias_in_what_the_filter_shows() -> None:
     assert abs(np.mean(offsets)) < 0.2
 
 
+@pytest.mark.parametrize(("last_row", "at_border"), [(2, True), (-8, False)])
+def test_an_end_that_the_border_cuts_at_a_small_angle_is_known_as_such(
+    rig: StereoRig, last_row: int, at_border: bool
+) -> None:
+    """The filter shows less and less of the thread for many of its pixels before the border."""
+    width, height = rig.image_size
+    border = height - 1
+    pixels = np.linspace([0.3 * width, border - 20], [0.8 * width, border + last_row], 200)
+    truth = rig.triangulate(pixels, pixels - [30.0, 0.0])
+    field = paint(rig, [truth], 0, noise=0.0)
+    shown = np.clip((border - np.arange(height)) / 4, 0, 1)[:, None, None]
+    field = replace(field, left=field.left * shown, right=field.right * shown)
+    curve = curve_through(truth[pixels[:, 1] < border - 3])
+    images = Images(field, rig, measure_levels(curve, field, rig))
+    start, stop = find_ends(curve, images)
+    assert start is not None
+    assert stop is not None
+    assert (start.at_border, stop.at_border) == (False, at_border)
+
+
 @pytest.mark.parametrize(("wide_px", "widens"), [(0.0, False), (2.0, False), (12.0, True)])
 def test_something_wider_that_goes_on_behind_an_end_is_told_from_a_hole(
     rig: StereoRig, wide_px: float, widens: bool

@@ -26,6 +26,8 @@ _ALONG = np.linspace(0, 1, 51)
 _BEND = np.linspace(0, 0.04, 5)
 # An end that points along the line of sight is taken to be foreshortened to this part of the rest, at most.
 _FORESHORTENED = 0.5
+# How near the border of an image the filter shows less and less of a thread that it cuts.
+_BORDER_PX = 4.0
 # An end that a view shows further away than this from the curve's own is another one, or covered.
 _SHOWN_PX = 3.0
 
@@ -92,8 +94,14 @@ def _find_end(tip: _Tip, images: Images) -> EndStep | None:
         return None
     widens = widens_at(x, alone, level)
     boundary = before_a_hole(widens, found)
-    at_border = not inside.all() and boundary > x[-1] - 3
+    at_border = not _clear_of_border(tip, boundary, images.rig.image_size)
     return EndStep(boundary, 1 / abs(tip.outward), at_border, widens=widens < boundary)
+
+
+def _clear_of_border(tip: _Tip, boundary: float, image_size: tuple[int, int]) -> bool:
+    """Whether the thread ends so far inside both images that it is the thread that ends there."""
+    place = min(int(np.searchsorted(tip.x, boundary)), len(tip.x) - 1)
+    return all(bool(view.inside(image_size, _BORDER_PX)[place]) for view in tip.both)
 
 
 def end_shifts(curve: Nurbs, images: Images) -> list[tuple[float, Float64] | None]:
