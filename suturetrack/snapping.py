@@ -159,7 +159,8 @@ def snap_point(
     """
     if not point[2] > 0:
         return None
-    reach_px = radius * rig.focal / point[2]
+    # More than it needs, also away from the axis: the distance in space decides.
+    reach_px = 2 * radius * rig.focal / point[2]
     near = []
     for view, pixel in zip((field.left, field.right), rig.project(point), strict=True):
         segments = find_ridges(view, config).segments

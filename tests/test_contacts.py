@@ -144,6 +144,12 @@ def test_a_divided_segment_keeps_its_partners() -> None:
     assert np.allclose(other, np.r_[line + shifts[2], line[15:], line + shifts[1]])
     # What was given is left as it was.
     assert len(joints.segments) == 4
+    # What was known of the joints that are no more says nothing of the new ones.
+    joints.bent, joints.hidden, joints.lead = frozenset({1, 2}), {5, 6}, {1: 3.0, 5: 4.0}
+    anew = joints.exchanged((2, 0), (6, 0))
+    assert anew.partner == {1: 6, 6: 1, 2: 5, 5: 2}
+    assert (anew.bent, anew.hidden, anew.lead) == (frozenset(), set(), {})
+    assert joints.hidden == {5, 6}
     assert joints.partner == {1: 2, 2: 1, 5: 6, 6: 5}
 
 

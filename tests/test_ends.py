@@ -9,7 +9,7 @@ from suturetrack.segmentation import Segmenter
 from suturetrack.stage import open_scene
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
 from suturetrack.tracking.end_watch import EndWatch
-from suturetrack.tracking.ends import EndStep, end_shifts, find_ends
+from suturetrack.tracking.ends import EndStep, end_shifts, find_ends, with_ends
 from suturetrack.tracking.energies import measure_levels
 from suturetrack.tracking.folds import doubled_ends
 from suturetrack.tracking.images import Images
@@ -49,6 +49,18 @@ def test_ends_are_found_without_bias_in_what_the_filter_shows() -> None:
             offsets.append(found.offset_px)
     assert np.abs(offsets).max() < 1.0
     assert abs(np.mean(offsets)) < 0.2
+
+
+def test_a_curve_of_one_span_is_drawn_out_as_any_other() -> None:
+    points = np.array([[0.0, 0.0, 200.0], [2.0, 1.0, 200.0], [4.0, 1.0, 201.0], [6.0, 0.0, 202.0]])
+    curve = nurbs.curve_from(3, nurbs.clamped_knots(np.zeros(0), 3), points)
+    longer = with_ends(curve, -0.1, 1.2)
+    s = np.linspace(-0.1, 1.2, 27)
+    ends = nurbs.evaluate(longer, np.array([0.0, 1.0]))
+    power = np.polynomial.Polynomial.fit
+    inside = np.linspace(0, 1, 9)
+    goes_on = [power(inside, c, 3)(s) for c in nurbs.evaluate(curve, inside).T]
+    np.testing.assert_allclose(ends, np.array(goes_on).T[[0, -1]], atol=1e-9)
 
 
 @pytest.mark.parametrize(("last_row", "at_border"), [(2, True), (-8, False)])

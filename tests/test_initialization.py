@@ -20,12 +20,14 @@ from suturetrack.initialization import (
     remaining,
 )
 from suturetrack.initialization.arms import Arms
-from suturetrack.initialization.colours import another_begins, darkening
+from suturetrack.initialization.colours import Tints, another_begins, darkening
 from suturetrack.initialization.config import InitializationConfig
 from suturetrack.initialization.crest import View, find_crest
 from suturetrack.initialization.depth import Depth
 from suturetrack.initialization.ends import read_end
-from suturetrack.initialization.segments import find_ridges, split_at_touches
+from suturetrack.initialization.joints import Joints
+from suturetrack.initialization.segments import Ridges, find_ridges, split_at_touches
+from suturetrack.initialization.threads import _without_faint_ends
 from suturetrack.initialization.topology import merge_ends
 from suturetrack.metrics import curve_error
 from suturetrack.polylines import polyline_distances, polyline_length
@@ -637,6 +639,28 @@ def test_a_thread_whose_end_lies_on_a_fainter_one_ends_there(seed: int, rig: str
 def test_a_thread_that_goes_on_in_the_shade_is_found_whole() -> None:
     """It is far fainter there, as a vein is; but it has its colour, and is darker."""
     assert_is_found_whole("clutter", 4415, "endoscope")
+
+
+@pytest.mark.parametrize("is_first", [False, True])
+def test_what_lies_in_the_shade_is_kept_at_either_end(is_first: bool) -> None:
+    """Behind the shade the thread is as bright as nowhere else, and as faint."""
+    u = np.arange(700)
+    strength, grey = np.where(u <= 400, 0.9, 0.3), np.select([u <= 400, u <= 520], [60, 40], 120)
+    clear, faint = (
+        np.c_[np.arange(a, b), np.full(b - a, 30.0)] for a, b in ((50, 400), (401, 650))
+    )
+    if is_first:
+        strength, grey = strength[::-1], grey[::-1]
+        clear, faint = (np.c_[699 - s[::-1, 0], s[::-1, 1]] for s in (clear, faint))
+    field = np.zeros((60, 700, 2), np.float32)
+    field[28:33, :, 0] = strength
+    pixels = np.c_[u, np.full(700, 30)].astype(np.uint16)
+    tints = Tints.of(Colours(pixels, np.repeat(grey[:, None], 3, axis=1).astype(np.uint8)))
+    ridges = Ridges(field, np.linalg.norm(field, axis=2), (clear, faint), 0.1, tints)
+    joints = Joints([clear, faint], {})
+    joints.join(*((0, 3) if is_first else (1, 2)), 0.1)
+    entries = _without_faint_ends(joints, ridges, joints.follow(0), 0)
+    assert [entry // 2 for entry in entries] == ([1, 0] if is_first else [0, 1])
 
 
 @pytest.mark.parametrize(("scenario", "seed"), [("fast", 6002), ("leaves-view", 6011)])

@@ -256,6 +256,24 @@ def test_what_is_found_again_is_followed_on_the_rows_that_show_it(
     assert rms(states[-1], points) < 0.1
 
 
+def test_a_thread_whose_seed_lies_outside_the_image_stays_lost(rig: StereoRig) -> None:
+    """It was lost above the images, and its seed with the source that remembered it."""
+    points = thread(0.0)
+    before, after = Tracker(rig), Tracker(rig)
+    before.seed(seed_on(rig, points))
+    (last,) = before.step(paint(rig, [points], 0)).states
+    assert last.curve is not None
+    above = replace(last.curve, control_points=last.curve.control_points - [0.0, 100.0, 0.0])
+    x, y, z = (float(c) for c in points[300] - [0.0, 100.0, 0.0])
+    after.resume(Seed("0", point=(x, y, z)), replace(last, curve=above))
+    states = [after.step(paint(rig, [points], i)).states[0] for i in range(1, 20)]
+    assert all(state.status is Status.LOST for state in states)
+    after.seed(seed_on(rig, points))
+    (state,) = after.step(paint(rig, [points], 20)).states
+    assert state.status is Status.TRACKING
+    assert rms(state, points) < 0.1
+
+
 def follow(
     rig: StereoRig, truths: Sequence[np.ndarray], away: range = range(0)
 ) -> list[ThreadState]:
@@ -824,10 +842,16 @@ def test_a_look_at_a_sure_curve_holds_no_recovery_up(
 
 def test_doubts_run_with_the_curve(rig: StereoRig) -> None:
     found = initialize(paint(rig, [thread(0.0)], 0), rig, seed_on(rig, thread(0.0)))
-    found = replace(found, doubts=(((0.2, 0.5),), ()))
+    reasons = "first end cut by the image border", "the left view shows the last end further on"
+    found = replace(found, reasons=reasons, doubts=(((0.2, 0.5),), ()))
     assert directed(found, found.curve) is found
     turned = directed(found, nurbs.reversed_curve(found.curve))
     assert turned.doubts == (((0.8, 0.5),), ())
+    assert turned.reasons == (
+        "last end cut by the image border",
+        "the left view shows the first end further on",
+    )
+    np.testing.assert_array_equal(turned.growth.marks, found.growth.marks[::-1])
     np.testing.assert_allclose(turned.curve.control_points, found.curve.control_points[::-1])
 
 

@@ -158,7 +158,8 @@ def test_the_strength_is_that_of_every_fourth_row(
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 12))
 def test_of_two_fields_the_longer_vectors_are_kept(seed: int, height: int, width: int) -> None:
     rng = np.random.default_rng(seed)
-    vectors, kept = rng.normal(size=(2, height, width, 2)).astype(np.float32)
+    # Whole 256ths: their squares are added without rounding, however the compiler does it.
+    vectors, kept = (rng.integers(-256, 257, (2, height, width, 2)) / 256).astype(np.float32)
     same = rng.random((height, width)) < 0.2
     vectors[same] = -kept[same]
     twin = reference.strongest([kept, vectors])
@@ -170,7 +171,7 @@ def test_of_two_fields_the_longer_vectors_are_kept(seed: int, height: int, width
 def test_the_pixels_of_long_vectors_come_row_by_row(
     seed: int, height: int, width: int, least: float
 ) -> None:
-    # Whole 256ths: their squares are added without rounding, however the compiler does it.
+    # Whole 256ths, as above.
     vectors = np.random.default_rng(seed).integers(-256, 257, (height, width, 2)) / 256
     vectors = vectors.astype(np.float32)
     pixels = ridge.longer_than(least, vectors, np.empty(height * width, np.int32))
@@ -641,6 +642,27 @@ def test_a_bright_thread_is_seen_after_the_seed(channel: str, coloured: bool) ->
     segmenter.learn(frame, seed)
     assert before < 0.15
     assert np.linalg.norm(segmenter.step(frame).left[80, 80]) > 0.4
+
+
+@pytest.mark.parametrize(("width", "sigma"), [(12, 7.8), (30, 18.6)])
+def test_the_contrast_of_a_wide_thread_follows_the_light(width: int, sigma: float) -> None:
+    u = np.linspace(120.0, 520.0, 401)
+    pixels = np.c_[u, np.interp(u, [100, 540], [200, 280])]
+    across = []
+    for level in (60, 110):
+        image = np.full((480, 640, 3), 255, np.uint8)
+        cv2.line(image, (100, 200), (540, 280), (level, level, level), width, cv2.LINE_8)
+        across.append(contrast_along(image, pixels, sigma).across)
+    np.testing.assert_allclose(across[1] / across[0], (255 - 110) / (255 - 60), rtol=0.02)
+
+
+def test_a_channel_that_shows_nothing_of_the_thread_gives_an_empty_field() -> None:
+    image = np.dstack([np.zeros((81, 81), np.uint8), line_image(0.4), line_image(0.4)])
+    frame, rig = StereoFrame(STAMP, image, image), small_rig(81, 81)
+    segmenter = Segmenter(rig, SegmentationConfig(channel="blue"))
+    segmenter.learn(frame, Seed(pixel=(40.0, 40.0)))
+    field = segmenter.step(frame)
+    assert not field.left.any()
 
 
 def test_threads_of_different_colours_are_seen_together() -> None:

@@ -15,6 +15,7 @@ from suturetrack.camera import StereoRig
 from suturetrack.initialization import Initialization, initialize
 from suturetrack.polylines import coverage, polyline_distances, polyline_length, polyline_offsets
 from suturetrack.tracking import Tracker, TrackingConfig, gauss_newton
+from suturetrack.tracking.alignment import shifted
 from suturetrack.tracking.clearness import Clearness
 from suturetrack.tracking.control_points import rearrange, refit
 from suturetrack.tracking.drift import Drift
@@ -592,6 +593,42 @@ def test_an_end_that_was_given_up_may_come_back(rig: StereoRig) -> None:
     assert given_up.length == pytest.approx(92.0, rel=0.01)
     assert all(state.status is Status.TRACKING for state in states[hidden.stop :])
     assert min(state.length for state in states[hidden.stop :]) > 97.0
+
+
+def test_what_is_said_of_the_samples_is_of_the_curve_that_is_left(rig: StereoRig) -> None:
+    """In the very field in which an end that has been hidden for long is cut off."""
+    points = thread(0.0)
+    u, v = rig.project(points)[0][0]
+    fields = [paint(rig, [points], i, hidden=[(u, v, 58.0)] * (i >= 30)) for i in range(110)]
+    states = follow(fields, rig, seed_on(rig, points))
+    cut = next(i for i, state in enumerate(states) if state.length < 90.0)
+    before, after = states[cut - 1], states[cut]
+    assert before.length > 98.0
+    assert not before.seen[:6].any()
+    assert after.seen.all()
+    assert after.sigma.max() < 0.5 < before.sigma[0]
+
+
+def test_both_ends_are_judged_alike(rig: StereoRig) -> None:
+    """However few samples the curve has."""
+    curve = curve_through(thread(0.0), spans=4)
+    images = Images(paint(rig, [thread(0.0)], 0), rig, (0.8, 0.8))
+    evidence = Evidence.of(gauss_newton.observe(curve, images, TrackingConfig()))
+    seen = np.arange(len(evidence.seen)) > 0
+    start, stop = (replace(evidence, seen=flags).evenly_seen for flags in (seen, seen[::-1]))
+    np.testing.assert_array_equal(start, stop[::-1])
+    assert 0 < np.count_nonzero(~start) < 5
+
+
+def test_a_jump_down_is_made_good_where_pixels_are_not_square() -> None:
+    k = np.array([[800.0, 0, 319.5], [0, 400.0, 239.5], [0, 0, 1]])
+    lens, baseline = (k, np.zeros(5)), np.array([-40.0, 0, 0])
+    rig = StereoRig.from_calibration((640, 480), lens, lens, np.eye(3), baseline, 1e-3)
+    before, curve, down = thread(0.0), curve_through(thread(0.0)), np.array([0.0, 12.0, 0.0])
+    levels = measure_levels(curve, paint(rig, [before], 0), rig)
+    images = Images(paint(rig, [before + down], 1), rig, levels)
+    moved = shifted(curve, images).control_points - curve.control_points
+    np.testing.assert_allclose(moved, np.broadcast_to(down, moved.shape), atol=1.0)
 
 
 @pytest.mark.parametrize("left", [200, 350, 480])

@@ -18,7 +18,7 @@ from suturetrack.initialization.doubts import (
     TOUCHES,
     Doubt,
 )
-from suturetrack.initialization.result import PlacedDoubts, in_words, remaining
+from suturetrack.initialization.result import ENDS, PlacedDoubts, in_words, remaining
 from suturetrack.initialization.samples import Samples
 from suturetrack.initialization.segments import ARM, Ridges
 from suturetrack.initialization.threads import NEXT_TO_NOTHING, Chain
@@ -176,17 +176,16 @@ def _in_words(doubts: list[list[Doubt]], rig: StereoRig, scale: int) -> list[str
 def _of_an_end(end: int, samples: Samples, further: list[list[int]]) -> tuple[float, list[str]]:
     """What an end (0 or 1) leaves of the confidence, and what is said of it; `further` are the ends behind
     which the left and the right view's own thread goes on."""
-    ordinal = ("first", "last")[end]
     reasons = [
-        f"the {name} view shows the {ordinal} end further on"
+        f"the {name} view shows the {ENDS[end]} further on"
         for name, ends in zip(("left", "right"), further, strict=True)
         if end in ends
     ]
     readings = [of_view[end] for of_view in samples.ends]
     if any(reading.at_border for reading in readings):
-        return 1.0, [*reasons, f"{ordinal} end cut by the image border"]
+        return 1.0, [*reasons, f"{ENDS[end]} cut by the image border"]
     if all(np.isnan(reading.offset_px) for reading in readings):
-        return _NO_END, [*reasons, f"{ordinal} end not seen as an end"]
+        return _NO_END, [*reasons, f"{ENDS[end]} not seen as an end"]
     return 1.0, reasons
 
 

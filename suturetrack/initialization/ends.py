@@ -48,7 +48,8 @@ def read_end(field: Float32, pixels: Float64) -> EndReading:
     places = np.where(x[:, None] <= 0, polyline_at(pixels, -x), pixels[0] + x[:, None] * outward)
     tangents = polyline_tangents(places)
     response = search.normal_profiles(field, places, tangents, _BESIDE, 0.0).max(1)
-    level = _END_LEVEL * float(np.median(response[x < -4]))
+    inside = response[x < -4]
+    level = _END_LEVEL * float(np.median(inside)) if len(inside) else 0.0
     run = int(_STAYS_PX / _STEP_PX)
     later = np.convolve(response, np.ones(run) / run)[run - 1 :]
     below = np.flatnonzero((response < level) & (later < level) & (x > -_INSIDE_PX + 4))

@@ -97,7 +97,13 @@ class Joints:
         before, others_before = joints.partner[one_end], joints.partner[other_end]
         joints.join(before, other_end, self.free_end)
         joints.join(others_before, one_end, self.free_end)
+        joints._know_nothing_of({before, other_end, others_before, one_end})
         return joints
+
+    def _know_nothing_of(self, ends: set[int]) -> None:
+        """Forgets how strands ran at ends that were joined to others."""
+        self.bent, self.hidden = self.bent - ends, self.hidden - ends
+        self.lead = {end: lead for end, lead in self.lead.items() if end not in ends}
 
     def _entered(self, entry: int, count: int) -> int:
         """The end at which the rest of a segment is entered behind so many of its points from an end on; it

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 
 from suturetrack.camera import StereoRig
+from suturetrack.nurbs import reversed_curve
 from suturetrack.types import Float32, Float64, Nurbs
 
 PlacedDoubts = tuple[tuple[tuple[float, float], ...], tuple[tuple[float, float], ...]]
 """The parameters of a curve where the left and the right view are in doubt, and what each leaves of the
 confidence."""
+ENDS = "first end", "last end"
+"""How reasons call the ends of a curve."""
 _MEANT = 0.3
 """What is left of the confidence where the seed lies on another strand as well: of twelve such starts,
 among 141 in clutter, three were right."""
@@ -79,6 +83,14 @@ class Initialization:
     """How much lower, against the left view, than the calibration says the right view lies; the curve
     is half of it off in each. 0 where that cannot be told from none."""
 
+    def turned_round(self) -> Initialization:
+        """The same, with the curve run from its other end on."""
+        reasons = tuple(re.sub("|".join(ENDS), _other_end, reason) for reason in self.reasons)
+        left, right = (tuple((1 - s, rest) for s, rest in view) for view in self.doubts)
+        growth = replace(self.growth, marks=self.growth.marks[::-1])
+        curve = reversed_curve(self.curve)
+        return replace(self, curve=curve, reasons=reasons, growth=growth, doubts=(left, right))
+
     def meaning(self, *, either: bool) -> Initialization:
         """The same, with a seed that may mean another strand as well, or one that does not."""
         if self.is_seed_shared == either:
@@ -87,6 +99,10 @@ class Initialization:
         reasons = (_EITHER, *others) if either else others
         confidence = self.confidence * _MEANT if either else self.confidence / _MEANT
         return replace(self, confidence=confidence, reasons=reasons, is_seed_shared=either)
+
+
+def _other_end(named: re.Match[str]) -> str:
+    return ENDS[1 - ENDS.index(named[0])]
 
 
 def remaining(doubts: PlacedDoubts) -> float:

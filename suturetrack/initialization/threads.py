@@ -340,10 +340,10 @@ def _without_faint_ends(
             last, rest = entries[-1], entries[:-1]
             sizes = [len(segments[e // 2]) for e in rest]
             level = np.average([strength[e] for e in rest], weights=sizes)
+            # In the second turn the thread is followed backwards, and left where its segments were entered.
+            before, behind = [inward(segments, e ^ 1 ^ leaves) for e in rest], last ^ 1 ^ leaves
             is_faint = strength[last] <= _FAINT * level and not _goes_on_in_the_shade(
-                ridges,
-                np.concatenate([inward(segments, e) for e in rest]),
-                inward(segments, last),
+                ridges, np.concatenate(before), inward(segments, behind)
             )
             is_short = len(segments[last // 2]) < _SPECK
             if not (is_faint or (is_short and is_beyond_gap(joints, last ^ leaves, ridges))):

@@ -69,8 +69,9 @@ _KEPT = 0.667
 _FAINTER = 1.2
 # Grey levels of a highlight in every channel, and the share of the picture below which there are none.
 _WHITE, _SCARCE = 225, 2e-4
-# Along a curve: how many windows are looked at, and half their width.
-_WINDOWS, _HALF_PX = 10, 32
+# Along a curve: how many windows are looked at, and half their width, in pixels and for wide threads in
+# sigmas; and how far from the rim, in sigmas, the filter does not look beyond it.
+_WINDOWS, _HALF_PX, _HALF, _FROM_RIM = 10, 32, 4.0, 3.0
 # Least cosine between two looks at one thread, or two places on it: 0.88 and more on one ground,
 # elsewhere any; other colours give up to 0.64.
 _ALIKE = 0.5
@@ -192,11 +193,11 @@ def contrast_along(image: Image, pixels: Float64, sigma: float) -> Contrast:
     """
     normals = unit(np.gradient(pixels, axis=0))[:, ::-1] * (-1, 1)
     across, clutter = [], []
+    half = max(_HALF_PX, math.ceil(_HALF * sigma))
     for i in np.linspace(0, len(pixels) - 1, min(_WINDOWS, len(pixels))).round().astype(int):
-        crop, centre = _window(image, pixels[i], _HALF_PX)
+        crop, centre = _window(image, pixels[i], half)
         scene = _Scene.of(crop, sigma, _FLOOR)
-        # At the rim of the window, the filter would look beyond it.
-        near = np.abs(pixels - pixels[i]).max(1) <= _HALF_PX - 3 * sigma
+        near = np.abs(pixels - pixels[i]).max(1) <= half - _FROM_RIM * sigma
         ridge = _Ridge(pixels[near] - pixels[i] + centre, normals[near])
         across.append(ridge.across(scene))
         clutter.append(scene.clutter)

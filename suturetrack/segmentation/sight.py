@@ -37,6 +37,8 @@ _AROUND = 8.0
 _FLANK = 1.0
 # Least automatic c, grey levels: what a flawless picture's rounding makes.
 _LEAST_C = 1.0
+# Least learned c, grey levels: of a channel that shows nothing of the thread.
+_FAINTEST_C = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ class Look:
         weights = np.rint(weights / np.abs(weights).sum() * 256) / 256
         c = None
         if self.across is not None:
-            c = abs(float(self.across * means @ weights)) / 2
+            c = max(abs(float(self.across * means @ weights)) / 2, _FAINTEST_C)
         return weights.astype(np.float32), c
 
 

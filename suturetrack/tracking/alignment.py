@@ -28,7 +28,8 @@ def shifted(curve: Nurbs, images: Images) -> Nurbs:
         shown = _shown(both, shifts, images)
         best = shifts[np.argmax(shown - _PRICE * np.hypot(*shifts.T))]
     depth = curve.control_points[:, 2:]
-    offset = np.hstack([best * depth / images.rig.focal, np.zeros_like(depth)])
+    focal = images.rig.left.projection[[0, 1], [0, 1]]
+    offset = np.hstack([best * depth / focal, np.zeros_like(depth)])
     return curve_from(curve.degree, curve.knots, curve.control_points + offset)
 
 

@@ -56,8 +56,8 @@ class TrackingConfig:
     """gauss-newton: sub-pixel offsets along the normals and a banded least-squares step; paper: the
     forces and updates of eqs. (4)-(16)."""
     search_px: float = 5.0
-    """How far to each side of the predicted curve the thread is looked for first; up to 6.5 times as
-    far where it is not found."""
+    """How far to each side of the predicted curve the thread is looked for first, with its flanks: its
+    middle is found 1.5 px less far; up to 6.5 times as far where it is not found."""
     iterations: int = 3
     """Gauss-Newton steps a field, at most."""
     noise_px: float = 0.1

@@ -179,7 +179,10 @@ def _extension(curve: Nurbs, end: int, beyond: Float64) -> tuple[Float64, Float6
 
 def with_ends(curve: Nurbs, start: float, stop: float) -> Nurbs:
     """The curve over [start, stop]; beyond its ends only where it has knots for that."""
+    if len(curve.control_points) == 4:
+        # A single span could not be drawn out.
+        curve = nurbs.insert_knot(curve, 0.5)
     inner = distinct(curve.knots)[[1, -2]]
-    if len(curve.control_points) > 4 and start < inner[0] and stop > inner[1]:
+    if start < inner[0] and stop > inner[1]:
         return nurbs.with_ends(curve, start, stop)
     return nurbs.part(curve, max(start, 0.0), min(stop, 1.0))

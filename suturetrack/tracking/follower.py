@@ -31,6 +31,7 @@ from suturetrack.tracking.mouth import Mouth
 from suturetrack.tracking.regrowth import loose_tails, regrown
 from suturetrack.tracking.reliability import (
     ASTRAY,
+    EVENLY,
     MOST,
     RELIABILITY_SAMPLES,
     SOME,
@@ -42,7 +43,7 @@ from suturetrack.tracking.sampling import length_of, resampled, values_at, views
 from suturetrack.tracking.spacing import respace
 from suturetrack.tracking.strands import NOBODY, Neighbours, Strand
 from suturetrack.tracking.whole import Whole
-from suturetrack.types import Bool, Nurbs, RidgeField, Status, ThreadState
+from suturetrack.types import Bool, Float64, Nurbs, RidgeField, Status, ThreadState
 
 _NS = 1e-9
 # An end that is drawn out further than the first is looked at again in the same field, so often at most.
@@ -117,6 +118,7 @@ class Follower:
         """When it was last held nowhere."""
         self._hidden = HiddenEnds(now)
         self._seen = np.ones(RELIABILITY_SAMPLES, bool)
+        self._sigma: Float64 = np.zeros(RELIABILITY_SAMPLES)
         self._share_seen = 1.0
         self.is_crowded = self.makes_detour = False
         """Whether other ridges run beside the thread, and whether they have made the curve too long or
@@ -194,7 +196,7 @@ class Follower:
         if self.config.method != "paper":
             evidence = self._grow_ends_anew(images, evidence, neighbours)
             evidence = self._lead_back(images, evidence, neighbours)
-        self._seen = evidence.evenly_seen
+        self._seen, self._sigma = evidence.evenly_seen, evidence.sigma
         if evidence.share >= MOST:
             model.seen_ns = model.capture_ns
             self._learn_levels(levels_along(evidence.fit.both, field))
@@ -205,7 +207,7 @@ class Follower:
             events.append(f"control points: {inserted} inserted, {removed} removed")
         astray, plain = evidence.astray(images, neighbours), evidence.plain(neighbours)
         status = self._judge(evidence, astray, plain, seconds)
-        return self._state(field, thread, evidence, status, events)
+        return self._state(field, thread, status, events)
 
     def _predicted(self, seconds: float) -> Nurbs:
         """The curve so much later."""
@@ -318,6 +320,9 @@ class Follower:
         self.model.curve = nurbs.part(self.model.curve, start / last, 1 - stop / last)
         self._drift.cut(start, stop)
         self._bends = Bends()
+        left = np.linspace(start / last, 1 - stop / last, RELIABILITY_SAMPLES)
+        self._seen, self._held = resampled(self._seen, left), resampled(self._held, left)
+        self._sigma = np.interp(left, EVENLY, self._sigma)
 
     def _start_again(self) -> None:
         """Looks from where the thread was last held, from the next field on."""
@@ -516,11 +521,10 @@ class Follower:
         self.model.levels = (0.8 * old[0] + 0.2 * now[0], 0.8 * old[1] + 0.2 * now[1])
 
     def _state(
-        self, field: RidgeField, thread: str, evidence: Evidence, status: Status, events: list[str]
+        self, field: RidgeField, thread: str, status: Status, events: list[str]
     ) -> ThreadState:
         model = self.model
-        sigma = evidence.sigma
-        depth = values_at(model.curve, np.linspace(0, 1, len(sigma)))[:, 2]
+        depth = values_at(model.curve, EVENLY)[:, 2]
         return ThreadState(
             stamp=field.stamp,
             thread=thread,
@@ -528,7 +532,7 @@ class Follower:
             curve=model.curve,
             length=length_of(model.curve),
             energies=energies(model.curve, field, self.rig, model.levels),
-            sigma=np.hypot(sigma, self._drift.px * depth / self.rig.focal),
-            seen=evidence.evenly_seen,
+            sigma=np.hypot(self._sigma, self._drift.px * depth / self.rig.focal),
+            seen=self._seen,
             events=tuple(events),
         )

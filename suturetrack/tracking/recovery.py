@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,14 +14,14 @@ from suturetrack.initialization import (
     InitializationError,
     initialize,
 )
-from suturetrack.nurbs import evaluate, reversed_curve, tangents
+from suturetrack.nurbs import evaluate, tangents
 from suturetrack.tracking.clearness import clear
 from suturetrack.tracking.config import TrackingConfig
 from suturetrack.tracking.follower import Follower
 from suturetrack.tracking.length import has_length, length_error
 from suturetrack.tracking.sampling import views
 from suturetrack.tracking.sureness import SURE
-from suturetrack.types import Float64, Nurbs, RidgeField, Seed
+from suturetrack.types import Float64, InputError, Nurbs, RidgeField, Seed
 
 # Places of the last curve that are looked at, and those of them from which the thread is looked for.
 _PLACES, _SEEDS = 24, 2
@@ -72,7 +72,7 @@ def find_again(
     for start in starts:
         try:
             found = setup.look(field, start)
-        except InitializationError:
+        except (InitializationError, InputError):
             continue
         if has_length(found.curve, known_lengths):
             return directed(found, last)
@@ -130,8 +130,5 @@ def directed(found: Initialization, last: Nurbs) -> Initialization:
         s: Float64 = np.linspace(0, 1, 16)
         return float(np.linalg.norm(evaluate(a, s) - evaluate(last, s), axis=1).sum())
 
-    other = reversed_curve(found.curve)
-    if apart(other) >= apart(found.curve):
-        return found
-    left, right = (tuple((1 - s, rest) for s, rest in view) for view in found.doubts)
-    return replace(found, curve=other, doubts=(left, right))
+    other = found.turned_round()
+    return other if apart(other.curve) < apart(found.curve) else found

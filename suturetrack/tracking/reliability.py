@@ -135,7 +135,7 @@ class Evidence:
     @cached_property
     def _nearest(self) -> Int64:
         s = self.fit.samples.s
-        return np.clip(np.searchsorted(s, EVENLY), 0, len(s) - 1)
+        return np.searchsorted((s[1:] + s[:-1]) / 2, EVENLY)
 
 
 @lru_cache(maxsize=2)
