@@ -160,7 +160,10 @@ def test_a_folder_that_is_none_of_pairs_is_refused(tmp_path: Path, calibration: 
     refused(folder, calibration, "1 images in left/, 2 in right/")
 
 
-@pytest.mark.parametrize(("left", "right"), [("", ""), ("left_", "right_")])
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [("", ""), ("left_", "right_"), ("Left_", "Right_"), ("L_", "R_"), ("cam0_", "cam1_")],
+)
 def test_a_folder_whose_sides_lack_different_images_is_refused(
     tmp_path: Path, calibration: Path, left: str, right: str
 ) -> None:
@@ -172,6 +175,18 @@ def test_a_folder_whose_sides_lack_different_images_is_refused(
             path.rename(path.with_name(prefix + path.name))
     words = rf"left/{left}0002\.png would be paired with right/{right}0001\.png, not with right/{right}0002"
     refused(tmp_path / "pairs", calibration, words)
+
+
+def test_time_stamps_that_agree_nowhere_are_paired_in_order(
+    tmp_path: Path, calibration: Path
+) -> None:
+    write_folder(tmp_path / "pairs")
+    for side, began in (("left", 1700000000.0), ("right", 1700000000.004)):
+        for path in list((tmp_path / "pairs" / side).iterdir()):
+            path.rename(path.with_name(f"{began + int(path.stem) / 20:.3f}.png"))
+    exposure = open_footage(tmp_path / "pairs", calibration).read(3)
+    assert exposure is not None
+    assert (told(exposure.left), told(exposure.right)) == ((3, 0), (3, 1))
 
 
 def cut(suffix: str) -> bytes:

@@ -8,6 +8,7 @@ from pathlib import Path
 from services.sources.footage import Exposure, check_pair, read_image, size_of
 from suturetrack.types import InputError
 
+_NUMBER = r"[0-9]+(?:\.[0-9]+)?"
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 
@@ -56,10 +57,12 @@ def _pairs(folder: Path) -> list[tuple[Path, Path]]:
         raise InputError(f"source {folder}: no images in left/ or right/")
     if len(left) != len(right):
         raise InputError(f"source {folder}: {len(left)} images in left/, {len(right)} in right/")
-    partner = {path.stem.replace("right", "left"): path for path in right}
-    for path, other in zip(left, right, strict=True):
-        namesake = partner.get(path.stem, other)
-        if namesake != other:
+    partner = dict(zip(_keys(right), right, strict=True))
+    keys = _keys(left)
+    unique = len(set(keys)) == len(set(partner)) == len(left)
+    for key, path, other in zip(keys, left, right, strict=True):
+        namesake = partner.get(key, other)
+        if unique and namesake != other:
             raise InputError(
                 f"source {folder}: left/{path.name} would be paired with right/{other.name}, not with "
                 f"right/{namesake.name}; each side lacks an image that the other has: delete those"
@@ -67,7 +70,18 @@ def _pairs(folder: Path) -> list[tuple[Path, Path]]:
     return list(zip(left, right, strict=True))
 
 
+def _keys(paths: list[Path]) -> list[tuple[float, ...] | str]:
+    """What the names of one side tell their images apart by: the numbers that vary, else the words."""
+    numbers = [[float(number) for number in re.findall(_NUMBER, path.stem)] for path in paths]
+    if len({len(row) for row in numbers}) == 1:
+        varying = [column for column in zip(*numbers, strict=True) if len(set(column)) > 1]
+        keys: list[tuple[float, ...] | str] = list(zip(*varying, strict=True))
+        if len(set(keys)) == len(paths):
+            return keys
+    return [path.stem.lower().replace("right", "left") for path in paths]
+
+
 def _order(path: Path) -> list[tuple[float, str]]:
     """Sorts names by the numbers in them: 2 before 10, and 10.25 before 10.5."""
-    parts = re.findall(r"[0-9]+(?:\.[0-9]+)?|[^0-9]+", path.stem)
+    parts = re.findall(rf"{_NUMBER}|[^0-9]+", path.stem)
     return [(float(part) if part[0] in "0123456789" else -1, part) for part in parts]
