@@ -253,6 +253,21 @@ def test_videos_that_do_not_match_are_refused(tmp_path: Path, calibration: Path)
     )
 
 
+def test_of_two_videos_the_rest_of_the_longer_one_is_left_out_and_told_once(
+    tmp_path: Path, calibration: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for side, (name, count) in enumerate((("left", COUNT), ("right", COUNT - 2))):
+        write_video(tmp_path / f"{name}.avi", [picture(i, side) for i in range(count)])
+    source = f"{tmp_path / 'left.avi'},{tmp_path / 'right.avi'}"
+    open_footage(source, calibration).close()
+    assert not caplog.messages
+    footage = open_footage(source, calibration)
+    assert [footage.read(i) is not None for i in (0, 0, 3, 4)] == [True, True, True, False]
+    (line,) = caplog.messages
+    assert "left.avi has 6 and " in line
+    assert "right.avi has 4 frames: only the first 4 of each are paired" in line
+
+
 @pytest.mark.parametrize("kept", [0.5, 1.0])
 def test_a_video_that_is_cut_off_ends_early_and_says_so(
     tmp_path: Path, calibration: Path, kept: float, caplog: pytest.LogCaptureFixture

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import cv2
 
 from services.sources.footage import Exposure, check_pair, halves, size_of
 from suturetrack.types import Image, InputError
+
+log = logging.getLogger("suturetrack")
 
 
 class VideoFootage:
@@ -29,6 +32,7 @@ class VideoFootage:
         self.fps = float(rates[0])
         counts = [int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) for capture in self._captures]
         self.frame_count: int | None = min(counts) if min(counts) > 0 else None
+        self._warning = _left_over(paths, counts)
         self._next = 0
         first = self._decode(0)
         if first is None:
@@ -37,6 +41,10 @@ class VideoFootage:
 
     def read(self, index: int) -> Exposure | None:
         """See `Footage`."""
+        # Not when it is opened, as who starts a run opens it, too.
+        if self._warning:
+            log.warning("%s", self._warning)
+            self._warning = ""
         if index == 0:
             return self._first
         while self._next < index:
@@ -66,6 +74,14 @@ class VideoFootage:
         left, right = images if len(images) == 2 else halves(images[0], str(self._paths[0]))
         check_pair(left, right, f"source {','.join(map(str, self._paths))}")
         return Exposure(round(index * 1e9 / self.fps), left, right)
+
+
+def _left_over(paths: list[Path], counts: list[int]) -> str:
+    """What is said of two videos of which one goes on after the other has ended."""
+    if min(counts) <= 0 or min(counts) == max(counts):
+        return ""
+    told = " and ".join(f"{path} has {count}" for path, count in zip(paths, counts, strict=True))
+    return f"{told} frames: only the first {min(counts)} of each are paired"
 
 
 def _open(path: Path) -> cv2.VideoCapture:
