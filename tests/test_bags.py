@@ -230,6 +230,15 @@ def test_a_broken_and_an_empty_bag_are_refused(tmp_path: Path, ros2: Ros) -> Non
     refused(path, "no image topic /x; there are", topics=("/x", LEFT))
 
 
+def test_a_bag_that_is_damaged_inside_is_refused(tmp_path: Path, ros2: Ros) -> None:
+    (path,) = write(tmp_path / "run.db3", ros2, frames(ros2)).glob("*.db3")
+    content = bytearray(path.read_bytes())
+    page = 4096 * (len(content) // 8192)
+    content[page : page + 4096] = b"\xff" * 4096
+    path.write_bytes(content)
+    refused(path.parent, "run: not a bag that can be read")
+
+
 def test_a_calibration_of_another_size_needs_a_scale(tmp_path: Path, ros2: Ros) -> None:
     small = [
         (

@@ -142,8 +142,8 @@ class BagFootage:
         try:
             for connection, received_ns, data in self._reader.messages(connections):
                 yield received_ns, _Raw(connection, data)
-        except (AnyReaderError, OSError) as error:
-            raise InputError(f"{self._where}: {_line(error)}") from error
+        except Exception as error:  # as in `_open`
+            raise _unreadable(self._where, error) from error
 
     def _open(self, raw: _Raw) -> Any:
         try:
@@ -159,8 +159,12 @@ def _open(path: Path) -> AnyReader:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
         reader.open()
     except Exception as error:  # whatever a broken file makes the parsers raise
-        raise InputError(f"source {path}: not a bag that can be read ({_line(error)})") from error
+        raise _unreadable(f"source {path}", error) from error
     return reader
+
+
+def _unreadable(where: str, error: Exception) -> InputError:
+    return InputError(f"{where}: not a bag that can be read ({_line(error)})")
 
 
 def _line(error: BaseException) -> str:
