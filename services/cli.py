@@ -105,6 +105,13 @@ def call(arguments: Sequence[str]) -> int:
     Raises:
         SystemExit: for --help, and for options that do not exist or do not parse.
     """
+    garbled = [argument for argument in arguments if not _is_text(argument)]
+    if garbled:
+        print(
+            f"suturetrack: {garbled[0]!r} is not UTF-8; give files and folders names that are",
+            file=sys.stderr,
+        )
+        return 2
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return 0
@@ -116,6 +123,15 @@ def call(arguments: Sequence[str]) -> int:
         print(f"suturetrack: no verb {name!r}; there are {', '.join(VERBS)}", file=sys.stderr)
         return 2
     return _run(name, VERBS[name], options)
+
+
+def _is_text(argument: str) -> bool:
+    """Whether an argument can be encoded; bytes that are not UTF-8 arrive as what cannot."""
+    try:
+        argument.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _run(name: str, verb: _Verb, arguments: list[str]) -> int:

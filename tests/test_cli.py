@@ -93,6 +93,23 @@ def test_run_without_a_source_is_a_wrong_call(call: Call) -> None:
     assert "--source" in err
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "--source", "film-\udcff.mkv"],
+        ["run", "--source", STAGE, "--run-dir", "run-\udcff"],
+        ["calibration", "check", "rig-\udcff.yaml"],
+        ["\udcff"],
+    ],
+)
+def test_a_name_that_is_not_utf_8_is_refused_in_one_line(call: Call, words: list[str]) -> None:
+    status, err = call(*words)
+    assert status == 2
+    assert err.startswith("suturetrack: '")
+    assert "\\udcff" in err
+    assert err.endswith("' is not UTF-8; give files and folders names that are\n")
+
+
 @pytest.mark.parametrize("columns", ["40", "200"])
 @pytest.mark.parametrize(
     ("words", "reason"),
