@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -100,11 +101,14 @@ class RunFolder:
         """Every row of the entities that match (`/plots/**`), in no order across entities.
 
         Once, too, where somebody has copied or merged files within the folder.
+
+        Raises:
+            InputError: a recording is damaged inside.
         """
         given: set[bytes] = set()
-        for reader in self._readers.values():
-            for chunk in reader.stream().filter(content=list(contents)):
-                for row in _rows(str(chunk.entity_path), chunk.to_record_batch()):
+        for file, reader in self._readers.items():
+            for entity, batch in _batches(file, reader, contents):
+                for row in _rows(entity, batch):
                     if row[_ROW_ID] not in given:
                         given.add(row[_ROW_ID])
                         yield row
@@ -269,14 +273,33 @@ def _reader(file: Path) -> tuple[RrdReader | None, str]:
             reader = RrdReader(file)
             reader.recordings()
         except (RuntimeError, ValueError) as error:
-            return None, str(error).removeprefix(f"Failed to read RRD file at {file}: ")
+            return None, _reason(error)
     return reader, ""
+
+
+def _reason(error: Exception) -> str:
+    """What Rerun says is wrong with a file, in one line, without the file."""
+    line = str(error).partition("\n")[0]
+    return re.sub(r"^Failed to read RRD file at .*?\.rrd: ", "", line)
 
 
 def _repair(file: Path, repaired: Path) -> bool:
     """Copies what is whole in a file that ends in the middle of a message."""
     command = [str(rerun_program()), "rrd", "merge", str(file), "-o", str(repaired)]
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+def _batches(
+    file: Path, reader: RrdReader, contents: Sequence[str]
+) -> Iterator[tuple[str, pa.RecordBatch]]:
+    """The chunks of one recording, with their entities; raises InputError."""
+    try:
+        for chunk in reader.stream().filter(content=list(contents)):
+            yield str(chunk.entity_path), chunk.to_record_batch()
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"{file} is damaged ({_reason(error)}); move it out of the folder to have the rest read"
+        ) from error
 
 
 def _rows(entity: str, batch: pa.RecordBatch) -> Iterator[Row]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -118,6 +119,28 @@ def test_a_file_cut_anywhere_is_read_as_far_as_it_goes(
     assert kept[0] == 0
     assert kept[-1] >= FRAMES - 1
     assert len(set(kept)) > 1
+
+
+def damaged(content: bytes) -> bytes:
+    """A recording whose largest message is nonsense in its second half, and whole around it."""
+    messages, at = [], 12
+    while at + 16 <= len(content):
+        size = struct.unpack_from("<8xQ", content, at)[0]
+        messages.append((size, at + 16))
+        at += 16 + size
+    size, at = max(messages)
+    return content[: at + size // 2] + b"\xff" * (size - size // 2) + content[at + size :]
+
+
+def test_a_file_that_is_damaged_inside_is_named(tmp_path: Path, whole: Path) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(whole, broken)
+    (broken / "tracker.rrd").write_bytes(damaged((whole / "tracker.rrd").read_bytes()))
+    said = outcomes(whole, broken, tmp_path / "new")
+    del said["view"]
+    for line in said.values():
+        assert "tracker.rrd is damaged (" in line
+        assert line.endswith("; move it out of the folder to have the rest read")
 
 
 def test_folders_without_a_recording_are_named(tmp_path: Path, whole: Path) -> None:
