@@ -160,6 +160,17 @@ def test_an_unknown_scenario_gets_the_list() -> None:
         next(tracking_rows(TrackingBench(scenarios=("nowhere",), seeds=1)))
 
 
+@pytest.mark.parametrize("seeds", [0, -1])
+def test_a_bench_without_seeds_is_refused(seeds: int) -> None:
+    for rows in (
+        lambda: next(tracking_rows(TrackingBench(seeds=seeds))),
+        lambda: next(initialization_rows(InitializationBench(seeds=seeds))),
+        lambda: segmentation.rows(SegmentationBench(seeds=seeds)),
+    ):
+        with pytest.raises(InputError, match=f"seeds {seeds}: use 1 or more"):
+            rows()
+
+
 def test_a_folder_without_pairs_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no <name>/calibration\.yaml"):
         next(initialization_rows(InitializationBench(pairs=tmp_path)))

@@ -17,7 +17,7 @@ from rich.progress import track
 
 from services.adaptation import Adaptation
 from services.bench import report
-from services.bench.pool import side_by_side
+from services.bench.pool import check_count, side_by_side
 from services.bench.spoils import SPOILS, Pair, Spoiler
 from services.bench.tracking import losses
 from services.sources import Footage, InputConfig, open_input
@@ -92,8 +92,7 @@ def run(config: FootageBench, console: Console) -> list[Row]:
     unknown = [name for name in config.spoils if name not in SPOILS]
     if unknown:
         raise InputError(f"no spoil {unknown[0]!r}; there are {', '.join(SPOILS)}")
-    if config.seeds < 1:
-        raise InputError(f"seeds {config.seeds}: use 1 or more")
+    check_count("seeds", config.seeds)
     curves = tuple(track(_as_it_is(config), "Tracking as it is", console=console, transient=True))
     if any(all(c is None for c in curves[:: SPOILS[name].step]) for name in config.spoils):
         raise InputError("nothing is tracked in the footage as it is: `suturetrack run` shows why")

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from services.bench import report
+from services.bench.pool import check_count
 from services.sources.footage import read_image
 from suturetrack import metrics, nurbs
 from suturetrack.calibration import load_calibration
@@ -81,6 +82,7 @@ class Row:
 
 def rows(config: InitializationBench) -> Iterator[Row]:
     """Every case in turn: the folder's pairs, then the bench top's scenes."""
+    check_count("seeds", config.seeds)
     if config.pairs is not None:
         yield from _pairs(config.pairs)
     names = config.scenarios or (() if config.pairs is not None else tuple(SCENARIOS))

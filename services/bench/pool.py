@@ -23,13 +23,18 @@ def side_by_side(
     Raises:
         InputError: fewer than one worker.
     """
-    if workers < 1:
-        raise InputError(f"workers {workers}: use 1 or more")
+    check_count("workers", workers)
     # Numba and OpenCV keep threads, which do not survive a fork.
     context = get_context("spawn")
     with ProcessPoolExecutor(workers, context, initializer=_end_with_parent) as pool:
         for future in as_completed([pool.submit(work, case) for case in cases]):
             yield future.result()
+
+
+def check_count(name: str, count: int) -> None:
+    """Raises InputError unless there is at least one of what a benchmark is asked for."""
+    if count < 1:
+        raise InputError(f"{name} {count}: use 1 or more")
 
 
 def _end_with_parent() -> None:

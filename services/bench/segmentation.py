@@ -16,6 +16,7 @@ from rich.console import Console
 from scipy.spatial import cKDTree
 
 from services.bench import report
+from services.bench.pool import check_count
 from suturetrack.segmentation import SegmentationConfig, Segmenter
 from suturetrack.segmentation.contrast import SIGMAS
 from suturetrack.stage import Picture, Scene, open_scene
@@ -71,6 +72,8 @@ class Row:
 
 def rows(config: SegmentationBench) -> list[Row]:
     """Runs every filter over every scene; times all of them in turns in one go."""
+    check_count("seeds", config.seeds)
+    check_count("repeats", config.repeats)
     scenes = [
         open_scene(name, config.first_seed + k, config.rig, picture=config.picture)
         for name in config.scenarios

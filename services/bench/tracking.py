@@ -15,7 +15,7 @@ from rich.progress import track
 
 from services.adaptation import follow
 from services.bench import report
-from services.bench.pool import side_by_side
+from services.bench.pool import check_count, side_by_side
 from suturetrack import metrics, nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.polylines import polyline_offsets
@@ -160,8 +160,7 @@ class Row:
 
 def rows(config: TrackingBench) -> Iterator[list[Row]]:
     """The rows of every case, as they are done."""
-    if config.seeds < 1:
-        raise InputError(f"seeds {config.seeds}: use 1 or more")
+    check_count("seeds", config.seeds)
     for name in config.scenarios:
         if name not in SCENARIOS:
             raise InputError(f"no scenario {name!r}; there are {', '.join(SCENARIOS)}")
