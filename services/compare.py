@@ -63,11 +63,13 @@ def run(config: CompareConfig) -> None:
     """Prints the tables.
 
     Raises:
-        InputError: fewer than two runs, or one that cannot be read.
+        InputError: fewer than two runs, one that cannot be read, or a tolerance that is none.
         SystemExit: a run exceeds a tolerance.
     """
     if len(config.run_dirs) < 2:
         raise InputError("give two or more run folders")
+    _check_tolerance("tolerance-mm", config.tolerance_mm)
+    _check_tolerance("tolerance-tracking", config.tolerance_tracking)
     folders = [RunFolder(path) for path in config.run_dirs]
     summaries = _told_apart([summarize(folder) for folder in folders], config.run_dirs)
     first = summaries[0]
@@ -78,6 +80,11 @@ def run(config: CompareConfig) -> None:
     excess = exceeded(summaries, distances, config)
     if excess:
         sys.exit(f"suturetrack compare: {'; '.join(excess)}")
+
+
+def _check_tolerance(name: str, tolerance: float | None) -> None:
+    if tolerance is not None and not 0 <= tolerance < float("inf"):
+        raise InputError(f"{name} {tolerance:g}: use a number of 0 or more")
 
 
 def _told_apart(summaries: list[RunSummary], paths: Sequence[Path]) -> list[RunSummary]:

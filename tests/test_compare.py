@@ -65,6 +65,14 @@ def test_fewer_tracked_frames_fail_their_tolerance(runs: tuple[Path, Path, Path]
         run(CompareConfig((runs[0], runs[2]), tolerance_tracking=24.0))
 
 
+@pytest.mark.parametrize("option", ["tolerance_mm", "tolerance_tracking"])
+@pytest.mark.parametrize("tolerance", [float("nan"), float("inf"), -1.0])
+def test_a_tolerance_that_is_none_is_refused(option: str, tolerance: float) -> None:
+    words = f"{option.replace('_', '-')} {tolerance:g}: use a number of 0 or more"
+    with pytest.raises(InputError, match=words):
+        run(CompareConfig((Path("first"), Path("other")), **{option: tolerance}))
+
+
 def test_one_run_is_nothing_to_compare(runs: tuple[Path, Path, Path]) -> None:
     with pytest.raises(InputError, match="two or more"):
         run(CompareConfig(runs[:1]))
