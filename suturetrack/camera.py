@@ -71,8 +71,10 @@ class StereoRig:
         namesake in `cv2.fisheye` where the distortion is equidistant.
 
         Raises:
-            InputError: the right camera stands left of, above or below the left one.
+            InputError: the right camera stands left of, above or below the left one, or looks
+                elsewhere.
         """
+        _check_same_way(rotation)
         if not fisheye and _is_rectified(left, right, rotation, translation):
             rotations = np.eye(3), np.eye(3)
             baseline = -float(translation[0])
@@ -303,6 +305,17 @@ def _is_rectified(
         and np.allclose(translation[1:], 0, atol=1e-9 * abs(float(translation[0])))
         and np.allclose(k1[[0, 1, 1], [0, 1, 2]], k2[[0, 1, 1], [0, 1, 2]], rtol=1e-6)
     )
+
+
+def _check_same_way(rotation: Float64) -> None:
+    """Raises InputError where the cameras are turned by more than 90 degrees against each other."""
+    cosine = (np.trace(rotation) - 1) / 2
+    if cosine < 0:
+        degrees = np.degrees(np.arccos(max(cosine, -1.0)))
+        raise InputError(
+            f"R turns the right camera away from the left one, by {degrees:.0f} degrees; cameras of a "
+            "pair look the same way, both upright"
+        )
 
 
 def _check_side_by_side(projection: Float64, translation: Float64) -> None:

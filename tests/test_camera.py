@@ -117,6 +117,15 @@ def test_cameras_that_are_not_left_and_right_are_refused() -> None:
         )
 
 
+@pytest.mark.parametrize("signs", [(-1.0, -1, 1), (-1.0, 1, -1), (1.0, -1, -1)])
+def test_cameras_that_look_different_ways_are_refused(signs: tuple[float, ...]) -> None:
+    k, none = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]]), np.zeros(5)
+    with pytest.raises(InputError, match=r"R turns the right camera away .* by 180 degrees"):
+        StereoRig.from_calibration(
+            (640, 480), (k, none), (k, none), np.diag(signs), np.array([-40.0, 0, 0]), 1e-3
+        )
+
+
 @pytest.mark.parametrize("factor", [0.5, 2.0, 1.5])
 def test_a_resized_rig_sees_the_same_points_in_resized_images(
     distorted_rig: StereoRig, factor: float
