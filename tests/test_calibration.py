@@ -408,6 +408,7 @@ def test_a_ros_pair_that_cannot_be_is_refused(tmp_path: Path, change: str, words
         ({"cam1": None}, "a camchain of two cameras is needed"),
         ({"cam0": {"camera_model": "omni"}}, "cam0 has the camera model 'omni'; use pinhole"),
         ({"cam0": {"distortion_model": "fov"}}, "cam0 has the distortion model 'fov'; use radtan"),
+        ({"cam0": {"distortion_model": [1]}}, r"cam0 has the distortion model \[1\]; use radtan"),
         ({"cam0": {"distortion_model": "equidistant"}}, "one camera is equidistant"),
         ({"cam0": {"distortion_coeffs": [0.1, 0.2]}}, "cam0 distortion_coeffs must be 4 numbers"),
         ({"cam0": {"intrinsics": "fine"}}, "cam0 intrinsics must be 4 numbers"),

@@ -42,7 +42,7 @@ def _lens(camera: dict[str, Any], name: str, where: str) -> Lens:
             f"{where}: {name} has the camera model {camera.get('camera_model')!r}; use pinhole"
         )
     model = camera.get("distortion_model")
-    if model not in _MODELS:
+    if not isinstance(model, str) or model not in _MODELS:
         raise InputError(
             f"{where}: {name} has the distortion model {model!r}; use {', '.join(_MODELS)}"
         )
