@@ -105,6 +105,7 @@ def test_a_saved_rig_is_read_back(tmp_path: Path, rig: StereoRig) -> None:
         ({"K1": np.eye(2)}, r"K1 is \(2, 2\), it must be \(3, 3\)"),
         ({"K1": K * np.nan}, "K1 holds values that are not finite"),
         ({"K1": K.T.copy()}, "K1 is not a camera matrix"),
+        ({"K2": K + 2 * np.eye(3, k=1) * [0, 1, 0]}, "K2 has a skew of 2 px; calibrate without"),
         ({"D2": np.zeros((1, 3))}, "D2 has 3 coefficients"),
         ({"ImageSize": np.array([[0.0, 480]])}, "ImageSize"),
         ({"ImageSize": np.array([[640.5, 480.0]])}, r"ImageSize \[640.5, 480.0\] .* whole pixels"),

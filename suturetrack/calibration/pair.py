@@ -13,6 +13,8 @@ from suturetrack.types import Float64, InputError
 METRES_PER_UNIT = {"m": 1.0, "mm": 0.001}
 _LARGEST_BASELINE_IN_METRES = 0.5
 """A stereo camera whose number of baseline units is below this is calibrated in metres."""
+_LARGEST_SKEW = 1e-6
+"""Over the focal length: no more than what rounding leaves of none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +92,11 @@ def check_lens(lens: Lens, image_size: tuple[int, int], where: str) -> None:
         raise InputError(f"{where}: {name} has a focal length that is not positive")
     if not np.allclose(k[2], [0, 0, 1]) or k[1, 0] != 0:
         raise InputError(f"{where}: {name} is not a camera matrix [fx 0 cx; 0 fy cy; 0 0 1]")
+    if abs(k[0, 1]) > _LARGEST_SKEW * k[0, 0]:
+        raise InputError(
+            f"{where}: {name} has a skew of {k[0, 1]:g} px; calibrate without skew, as the cameras' "
+            "model has none"
+        )
     if np.any(k[:2, 2] < -0.5 * size) or np.any(k[:2, 2] > 1.5 * size):
         raise InputError(
             f"{where}: {name} has its principal point {k[:2, 2].round(1).tolist()} far outside "
