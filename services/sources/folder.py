@@ -59,7 +59,7 @@ def _pairs(folder: Path) -> list[tuple[Path, Path]]:
         raise InputError(f"source {folder}: {len(left)} images in left/, {len(right)} in right/")
     partner = dict(zip(_keys(right), right, strict=True))
     keys = _keys(left)
-    unique = len(set(keys)) == len(set(partner)) == len(left)
+    unique = len(set(keys)) == len(partner) == len(left)
     for key, path, other in zip(keys, left, right, strict=True):
         namesake = partner.get(key, other)
         if unique and namesake != other:
