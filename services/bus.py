@@ -27,6 +27,8 @@ DEPTH = 1024
 _MOST_PUBLISHERS = 256
 _MOST_KEPT = 256
 _POLL_S = 0.02
+_LONGEST_GAP = 1_000_000
+"""Messages that one gap may count: more are hours of a stream, and such a number is garbage, no count."""
 
 Deliver = Callable[[str, Packet], None]
 Reply = Callable[[Packet | str], None]
@@ -126,7 +128,9 @@ class Reader(Generic[T]):
         sender = (key, header.publisher)
         if len(self.expected) >= _MOST_PUBLISHERS and sender not in self.expected:
             self.expected.clear()
-        gap = max(0, header.number - self.expected.get(sender, header.number))
+        gap = header.number - self.expected.get(sender, header.number)
+        if not 0 <= gap <= _LONGEST_GAP:
+            gap = 0
         if gap and self.topic.keep == "every":
             self._bus.complain(f"{gap} messages on {key} were lost on the way")
         self.lost += gap

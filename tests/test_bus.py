@@ -221,6 +221,16 @@ def test_gaps_in_the_numbers_are_lost_messages(connect: Connect) -> None:
     assert (reader.lost, reader.passed_over) == (2, 0)
 
 
+def test_a_number_that_leaps_far_or_back_counts_no_lost_messages(connect: Connect) -> None:
+    tracker, source = connect("tracker"), connect("source")
+    reader = source.every(topics.STEP)
+    assert tracker.wait_for_readers(topics.STEP, 10)
+    for number in (0, 2**63 - 1, 1, 3):
+        put(tracker, "step", wire.encode(stamp(number % 100), "tracker-1", number))
+    assert all(reader.get(10) for _ in range(4))
+    assert reader.lost == 1
+
+
 def test_the_last_messages_outlive_their_sender(connect: Connect) -> None:
     source, tracker = connect("source"), connect("tracker")
     source.keep(topics.SEEDING, lambda seed, _: seed.pixel != (9.0, 9.0))
