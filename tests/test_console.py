@@ -331,6 +331,8 @@ def test_no_other_site_gets_in(stage: Stage) -> None:
             assert await status(client, "/page.js") == 200
             assert await status(client, "/live", Origin="http://evil.example") == 403
             assert await status(client, "/", Host="evil.example") == 403
+            for port in ("99999999", "abc"):
+                assert await status(client, "/", Host=f"localhost:{port}") == 400
             async with client.ws_connect("/live", headers={"Origin": here}):
                 pass
 

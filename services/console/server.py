@@ -143,7 +143,10 @@ class Console:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
         """Only pages of this server may connect: no other site in the operator's browser."""
-        host = request.url.host or ""
+        try:
+            host = request.url.host or ""
+        except ValueError as error:
+            raise web.HTTPBadRequest(text="the Host of the request is no address") from error
         if not self._token and host not in _LOCAL:
             raise web.HTTPForbidden(text="this console serves this machine only")
         origin = request.headers.get("Origin")
