@@ -104,6 +104,14 @@ def test_unknown_names_are_answered_with_the_known_ones() -> None:
         open_scene("figure8-107").seed_pixel(0, "b")
 
 
+@pytest.mark.parametrize("size", [(63, 64), (9000, 64), (64, 100_000)])
+def test_images_that_no_message_can_carry_are_refused(size: tuple[int, int]) -> None:
+    with pytest.raises(
+        InputError, match=f"images of {size[0]}x{size[1]} .*: use sides of 64 to 8192"
+    ):
+        open_scene("figure8-107", picture=Picture(size=size))
+
+
 @pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_scenario_shows_its_threads(name: str, rig: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from suturetrack.camera import StereoRig
+from suturetrack.camera import LARGEST_SIDE, StereoRig
 from suturetrack.kernels import tubes
 from suturetrack.polylines import polyline_length
 from suturetrack.stage import appearance, background, clutter
@@ -57,9 +57,11 @@ def open_scene(
         raise InputError(f"no scenario {name!r}; use one of {', '.join(SCENARIOS)}")
     if seed < 0:
         raise InputError(f"seed {seed} of the scene: use a whole number from 0 up")
-    if min(picture.size) < 64 or fps <= 0:
+    if min(picture.size) < 64 or max(picture.size) > LARGEST_SIDE or fps <= 0:
         width, height = picture.size
-        raise InputError(f"images of {width}x{height} at {fps} fps: use 64x64 or more, above 0 fps")
+        raise InputError(
+            f"images of {width}x{height} at {fps} fps: use sides of 64 to {LARGEST_SIDE} px, above 0 fps"
+        )
     for setting, (lowest, highest) in LIMITS.items():
         value = getattr(picture, setting)
         if value is not None and not lowest <= value <= highest:
