@@ -39,6 +39,10 @@ class NoAnswer(Exception):
     """Nobody answered a question, or the one who should have refused it; the text says why."""
 
 
+class BadAnswer(NoAnswer):
+    """There is an answer, and it is none that this process understands."""
+
+
 class Transport(Protocol):
     """What carries packets; keys are full keys or key expressions."""
 
@@ -284,15 +288,18 @@ class Bus:
         try:
             return wire.decode(packet, question.answer)[0]
         except WireError as error:
-            raise NoAnswer(f"{question.server} sent a bad answer: {error}") from error
+            raise BadAnswer(f"{question.server} sent a bad answer: {error}") from error
 
     def ask_until_answered(self, question: Question[Q, A], content: Q) -> A | None:
-        """Asks again until there is an answer; None when stopped."""
+        """Asks again until there is a good answer; None when stopped."""
         answers: list[A] = []
 
         def answered() -> bool:
             try:
                 answers.append(self.ask(question, content, timeout=1.0))
+            except BadAnswer as error:
+                self.complain(str(error))
+                return False
             except NoAnswer:
                 return False
             return True

@@ -231,6 +231,22 @@ def test_a_number_that_leaps_far_or_back_counts_no_lost_messages(connect: Connec
     assert reader.lost == 1
 
 
+def test_who_asks_until_answered_tells_of_bad_answers(connect: Connect) -> None:
+    source, tracker = connect("source"), connect("tracker")
+    complaints = list[str]()
+
+    def complain(text: str) -> None:
+        complaints.append(text)
+        tracker.stop.set()
+
+    tracker.complain = complain
+    bad = wire.encode(stamp(1))
+    source._transport.serve("suturetrack/test/calibration", lambda _key, _asked, reply: reply(bad))
+    assert tracker.ask_until_answered(topics.CALIBRATION, None) is None
+    assert len(complaints) == 1
+    assert complaints[0].startswith("source sent a bad answer: ")
+
+
 def test_the_last_messages_outlive_their_sender(connect: Connect) -> None:
     source, tracker = connect("source"), connect("tracker")
     source.keep(topics.SEEDING, lambda seed, _: seed.pixel != (9.0, 9.0))
