@@ -7,8 +7,11 @@ import errno
 import importlib
 import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 
@@ -28,6 +31,9 @@ for _name in _ONE_THREAD:
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 os.environ.setdefault("RUST_LOG", RUST_LOG)
+
+_INTERRUPTED = 130
+"""The exit status after Ctrl-C, as shells count it."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +91,8 @@ def main() -> None:
     try:
         status = call(arguments)
         sys.stdout.flush()
+    except KeyboardInterrupt:
+        status = _INTERRUPTED
     except OSError as error:
         # Who read has seen enough, as `| head` does.
         if error.errno not in (errno.EPIPE, errno.ENOSPC):
@@ -135,13 +143,14 @@ def _is_text(argument: str) -> bool:
 
 
 def _run(name: str, verb: _Verb, arguments: list[str]) -> int:
-    # Late, so that the overview and wrong verbs are quick.
-    from services.arguments import parse
-    from suturetrack.types import InputError
+    with _quick_to_interrupt():
+        # Late, so that the overview and wrong verbs are quick.
+        from services.arguments import parse
+        from suturetrack.types import InputError
 
-    module = importlib.import_module(verb.module)
-    kind = getattr(module, verb.config)
-    config = parse(kind, f"suturetrack {name}", arguments)
+        module = importlib.import_module(verb.module)
+        kind = getattr(module, verb.config)
+        config = parse(kind, f"suturetrack {name}", arguments)
     try:
         if verb.process:
             from services import service
@@ -154,8 +163,25 @@ def _run(name: str, verb: _Verb, arguments: list[str]) -> int:
         print(f"suturetrack {name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        return 130
+        return _INTERRUPTED
     return 0
+
+
+@contextmanager
+def _quick_to_interrupt() -> Iterator[None]:
+    """SIGINT ends the process at once and without a word.
+
+    A module that is being loaded has nothing to complete, and may swallow the exception or tell of it.
+    """
+    in_charge = threading.current_thread() is threading.main_thread()
+    if not in_charge or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda *_: os._exit(_INTERRUPTED))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _leave(status: int) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tomllib
@@ -270,6 +271,37 @@ def test_the_overview_loads_no_heavy_library() -> None:
     code = "import sys; from services import cli; cli.call([]); print('numpy' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.endswith("False\n")
+
+
+INTERRUPTS = """
+import os, signal
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+finally:
+    raise ImportError
+"""
+
+
+@pytest.mark.parametrize("verb", ["status", "tracker"])
+def test_an_interrupt_while_modules_are_loaded_ends_a_verb_without_a_word(
+    tmp_path: Path, verb: str
+) -> None:
+    """A library that every verb needs is stood in for by one that interrupts, and hides it."""
+    (tmp_path / "tyro.py").write_text(INTERRUPTS)
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    out = subprocess.run(
+        [sys.executable, "-m", "services.cli", verb],
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert (out.returncode, out.stdout, out.stderr) == (130, "", "")
+
+
+def test_an_interrupt_is_an_exception_again_once_a_verb_runs(call: Call) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    assert call("inspect", "none")[0] == 1
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.parametrize("arguments", ["--help", "run --help", "scenes"])
