@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -412,39 +413,95 @@ def test_images_are_made_only_while_somebody_looks(stage: Stage) -> None:
     asyncio.run(flow())
 
 
-TALKER = f"""#!{sys.executable}
-import pathlib, signal, sys
-signal.signal(signal.SIGINT, lambda *_: sys.exit("record: the disk is full"))
-sys.stderr.write(1_000_000 * "a warning\\n")
-pathlib.Path("said").touch()
+BEGINS = """
+folder = pathlib.Path(sys.argv[sys.argv.index("--run-dir") + 1])
+folder.mkdir(parents=True)
+(folder / "source.rrd").touch()
+"""
+SLOW = f"""
+signal.signal(signal.SIGINT, lambda *_: sys.exit(0))
+pathlib.Path("started").touch()
+while not pathlib.Path("go").exists():
+    time.sleep(0.01)
+{BEGINS}
 signal.pause()
 """
+TALKER = f"""
+signal.signal(signal.SIGINT, lambda *_: sys.exit("record: the disk is full"))
+sys.stderr.write(1_000_000 * "a warning\\n")
+{BEGINS}
+signal.pause()
+"""
+FAILS = 'sys.exit("record: the disk is full")'
+Recorder = Callable[[str], Recording]
 
 
-def test_a_recording_may_say_much_and_its_last_word_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    """A recording by a child that does what it is told here."""
+
+    def make(text: str) -> Recording:
+        program = tmp_path / "program"
+        program.write_text(f"#!{sys.executable}\nimport pathlib, signal, sys, time\n{text}")
+        program.chmod(0o700)
+        monkeypatch.setattr(sys, "executable", str(program))
+        monkeypatch.chdir(tmp_path)
+        return Recording("rig", None)
+
+    return make
+
+
+def test_a_recording_is_claimed_and_completed_when_it_has_begun(recorder: Recorder) -> None:
+    recording = recorder(SLOW)
+    with ThreadPoolExecutor() as workers:
+        started = workers.submit(recording.start)
+        wait_until(Path("started").exists)
+        with pytest.raises(InputError, match="begins or ends already"):
+            recording.start()
+        assert recording.folder is None
+        assert not recording.problem
+        stopped = workers.submit(recording.stop)
+        Path("go").touch()
+        folder = started.result(20)
+        assert any(folder.glob("*.rrd"))
+        assert stopped.result(20) == folder
+
+
+def test_a_recording_that_ends_before_it_begins_says_why(recorder: Recorder) -> None:
+    recording = recorder(FAILS)
+    with pytest.raises(InputError, match="failed: record: the disk is full"):
+        recording.start()
+
+
+def test_a_recording_that_does_not_begin_is_told(
+    recorder: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    program = tmp_path / "talker"
-    program.write_text(TALKER)
-    program.chmod(0o700)
-    monkeypatch.setattr(sys, "executable", str(program))
-    monkeypatch.chdir(tmp_path)
-    recording = Recording("rig", None)
+    monkeypatch.setattr("services.console.recording._BEGIN_S", 0.1)
+    recording = recorder(SLOW)
+    with pytest.raises(InputError, match=r"did not begin; does a source run\?"):
+        recording.start()
+    with pytest.raises(InputError, match="nothing is recorded"):
+        recording.stop()
+
+
+def test_who_closes_waits_for_no_beginning(recorder: Recorder) -> None:
+    recording = recorder(SLOW)
+    with ThreadPoolExecutor() as workers:
+        started = workers.submit(recording.start)
+        wait_until(Path("started").exists)
+        recording.close()
+        assert isinstance(started.exception(10), InputError)
+
+
+def test_a_recording_may_say_much_and_its_last_word_is_told(recorder: Recorder) -> None:
+    recording = recorder(TALKER)
     recording.start()
-    wait_until((tmp_path / "said").exists)
     with pytest.raises(InputError, match="failed: record: the disk is full"):
         recording.stop()
 
 
-def test_a_recording_that_ended_by_itself_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    program = tmp_path / "talker"
-    program.write_text("#!/bin/sh\necho 'record: the disk is full' >&2\nexit 1\n")
-    program.chmod(0o700)
-    monkeypatch.setattr(sys, "executable", str(program))
-    monkeypatch.chdir(tmp_path)
-    recording = Recording("rig", None)
+def test_a_recording_that_ended_by_itself_says_why(recorder: Recorder) -> None:
+    recording = recorder(BEGINS + FAILS)
     assert not recording.problem
     recording.start()
     wait_until(lambda: recording.problem.endswith("failed: record: the disk is full"))
