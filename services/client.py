@@ -50,6 +50,8 @@ Area = tuple[float, float, float, float]
 _ARRIVAL_S = 3.0
 """How long whoever answers may take to appear."""
 _ANSWER_S = 2.0
+_BEAT_S = 1.3
+"""How long it is listened for processes that are not ready: each tells of itself once a second."""
 _GONE_NS = 3_000_000_000
 """A thread of which nothing has come for so long, nor since the last but one state of another, is followed no
 more: the tracker that held it has ended, and another one runs."""
@@ -356,18 +358,37 @@ class Client:
             raise Unavailable("this client is closed; connect again")
 
     def _unavailable(self, what: str) -> Unavailable:
-        """The error, with the processes that are missing and how to start them."""
+        """The error, with the processes that are not ready, and how to start those that are missing."""
+        self._require_open()
+        heard = self._beginners()
         self._require_open()  # who closes it meanwhile ends all waiting
         alive, rig = self.bus.alive(), self.bus.rig
         absent = [name for name in topics.PROCESSES if name not in alive]
-        if not absent:
-            return Unavailable(what)
-        by_hand = " and ".join(f"`suturetrack {name} --rig {rig}`" for name in absent)
-        start = "`suturetrack run`" if len(absent) == len(topics.PROCESSES) else by_hand
-        return Unavailable(
-            f"{what}; no {' and no '.join(absent)} runs on rig {rig!r}; start one with {start}, "
-            "or name the rig that runs"
-        )
+        said = [what, *(f"the {name} {heard[name]}" for name in absent if name in heard)]
+        missing = [name for name in absent if name not in heard]
+        if missing:
+            by_hand = " and ".join(f"`suturetrack {name} --rig {rig}`" for name in missing)
+            start = "`suturetrack run`" if len(missing) == len(topics.PROCESSES) else by_hand
+            said += [
+                f"no {' and no '.join(missing)} runs on rig {rig!r}",
+                f"start one with {start}, or name the rig that runs",
+            ]
+        return Unavailable("; ".join(said))
+
+    def _beginners(self) -> dict[str, str]:
+        """What those who run and are not ready yet wait for, in words, by process."""
+        sought = set(topics.PROCESSES) - self.bus.alive()
+        heard: dict[str, str] = {}
+        deadline = time.monotonic() + _BEAT_S
+        with self.bus.every(topics.HEALTH) as reader:
+            while sought - heard.keys():
+                health = reader.get(max(0.0, deadline - time.monotonic()))
+                if health is None:
+                    break
+                if not health.ready:
+                    waits = f"waits for the {health.awaits}"
+                    heard[health.process] = waits if health.awaits else "is not ready yet"
+        return heard
 
     def _listen(self) -> None:
         for state in self._reader:

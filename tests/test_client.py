@@ -17,7 +17,7 @@ from services import topics, wire
 from services.bus import Bus
 from services.client import Client, Refused, Seen, Unavailable
 from services.memory_transport import Hub
-from services.messages import Forgotten, GraspReply, SeedReply
+from services.messages import Forgotten, GraspReply, Health, Latency, SeedReply
 from suturetrack import nurbs
 from suturetrack.camera import StereoRig
 from suturetrack.types import (
@@ -413,6 +413,7 @@ def test_a_closed_client_says_so(stage: Stage) -> None:
 
 def test_nobody_there_is_said_plainly(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.client._ARRIVAL_S", 0.05)
+    monkeypatch.setattr("services.client._BEAT_S", 0.05)
     nobody = (
         "does not answer; no source and no segmenter and no tracker runs on rig 'rig'; start one"
     )
@@ -426,3 +427,27 @@ def test_nobody_there_is_said_plainly(stage: Stage, monkeypatch: pytest.MonkeyPa
         stage.client.grasp(fraction=0.5)
     with pytest.raises(Unavailable, match=f"no frames come in which to look; {absent}"):
         stage.client.seed(laser=True)
+
+
+def test_those_who_begin_are_named_with_what_they_wait_for(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They run: nobody should start them again."""
+    monkeypatch.setattr("services.client._ARRIVAL_S", 0.05)
+    idle = Health("", 0, None, 0.0, Latency(), 0.0, Latency(), 0, 0, 0, 0.0, ready=False)
+
+    def beat() -> None:
+        assert stage.tracker.wait_for_readers(topics.HEALTH, 10)
+        for name, awaited in (("tracker", "source"), ("segmenter", "")):
+            stage.tracker.publish(topics.HEALTH, replace(idle, process=name, awaits=awaited))
+
+    beating = threading.Thread(target=beat)
+    beating.start()
+    with pytest.raises(Unavailable) as caught:
+        stage.client.grasp(fraction=0.5)
+    beating.join(10)
+    assert str(caught.value) == (
+        "the tracker does not answer; the segmenter is not ready yet; the tracker waits for the source; "
+        "no source runs on rig 'rig'; start one with `suturetrack source --rig rig`, "
+        "or name the rig that runs"
+    )
