@@ -86,6 +86,17 @@ def test_a_tool_tip_finds_the_thread_within_its_radius(
     assert snap_point(field, rig, np.array([0.0, 0.0, -5.0]), 8.0) is None
 
 
+def test_a_tool_tip_reaches_as_far_away_from_the_axis(rig: StereoRig) -> None:
+    """Where a place in front of it is further aside in the images than one beside it."""
+    upright = np.c_[np.full(601, 60.0), np.linspace(-40, 40, 601), np.full(601, 170.0)]
+    field = paint(rig, [upright], 0)
+    for angle in np.radians([0, 20, 40, 60]):
+        tip = np.array([60.0 - 9.5 * np.cos(angle), 0.0, 170.0 + 9.5 * np.sin(angle)])
+        found = snap_point(field, rig, tip, 10.0)
+        assert found is not None
+        assert off(upright, found) < 0.5
+
+
 def test_a_click_in_the_right_view_means_the_thread_that_shows_there(rig: StereoRig) -> None:
     """Two threads cross the row of the click in the left view."""
     lines = [thread(0.3), thread(1.1, depth=170.0) + np.array([25.0, 2.0, 0.0])]
